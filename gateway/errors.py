@@ -1,0 +1,71 @@
+"""Every exception that rtugate raises on purpose, as one tree.
+
+    GatewayError
+    ├── ConfigError             the configuration cannot be used; carries every finding
+    ├── RequestInvalid          a request that must not be sent or stored: caller's mistake
+    │   └── PointsOutOfRange    points that the register does not have
+    ├── RequestRefused          a request that came to us is answered with an exception code
+    ├── QueueFull               a command queue has no room: the write is refused whole
+    ├── DeviceRefused           the device answered with an exception code
+    ├── ReplyMismatch           the reply does not answer the request that was sent
+    └── LinkError               the line itself
+        ├── LinkUnavailable     port missing, connection refused, address in use
+        ├── LinkSettingRefused  the port is there but cannot do what is asked of it
+        └── LinkLost            it was open and is gone
+
+Anything else that is raised is a bug: it ends its task, and the supervisor sees it.
+"""
+
+from __future__ import annotations
+
+
+class GatewayError(Exception):
+    """The root: whoever catches this catches everything deliberate and no bug."""
+
+
+class RequestInvalid(GatewayError, ValueError):
+    """A request outside the limits of the protocol or of the register; nothing was sent."""
+
+
+class PointsOutOfRange(RequestInvalid):
+    """Points that the register's table does not have."""
+
+
+class RequestRefused(GatewayError):
+    """A request to us that earns exception *code* (application protocol V1.1b3, section 7)."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}")
+        self.code = code
+
+
+class QueueFull(GatewayError):
+    """No room for one more command; nothing was stored and nothing will be sent."""
+
+
+class DeviceRefused(GatewayError):
+    """The device answered with exception *code* (application protocol V1.1b3, section 7)."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"the device answered with exception {code}")
+        self.code = code
+
+
+class ReplyMismatch(GatewayError):
+    """A whole, undamaged reply that answers another question than the one asked."""
+
+
+class LinkError(GatewayError):
+    """A line that cannot be used; the text says which and why, for a person."""
+
+
+class LinkUnavailable(LinkError):
+    """The port is missing or busy, the connection was refused, the address is in use."""
+
+
+class LinkSettingRefused(LinkError):
+    """The port exists but cannot do what is asked: parity on a pty, a speed, RS-485."""
+
+
+class LinkLost(LinkError):
+    """The port or connection was open and is gone: unplugged, closed by the other side."""

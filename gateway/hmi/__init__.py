@@ -1,0 +1,1 @@
+"""The text menu (human-machine interface): screens, telnet, the seat."""

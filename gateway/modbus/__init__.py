@@ -1,0 +1,1 @@
+"""The Modbus protocol as pure code: bytes in, values out; no ports, no clock, no threads."""
