@@ -18,9 +18,19 @@ Anything else that is raised is a bug: it ends its task, and the supervisor sees
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class GatewayError(Exception):
     """The root: whoever catches this catches everything deliberate and no bug."""
+
+
+class ConfigError(GatewayError):
+    """The configuration cannot be used; every *finding* is a line for a person (see ``store``)."""
+
+    def __init__(self, findings: Sequence[object]) -> None:
+        super().__init__("\n".join(str(finding) for finding in findings))
+        self.findings = tuple(findings)
 
 
 class RequestInvalid(GatewayError, ValueError):

@@ -1,0 +1,48 @@
+"""Opening a port again and again: later and later, and talked about once per change (spec section 2 and 5).
+
+It opens nothing itself. One thread uses it.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Final
+
+from gateway.clock import Clock
+
+FIRST_S: Final = 0.5
+MOST_S: Final = 30.0
+
+log = logging.getLogger(__name__)
+
+
+class Backoff:
+    """When a line may be opened again, and why it had to be."""
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        """*name* of the line, for the log."""
+        self._name = name
+        self._clock = clock
+        self._after_s = FIRST_S
+        self._due_s = clock.monotonic()
+        self.trouble = ""  # why the line cannot be used, for people; "" while it can
+
+    def wait_s(self) -> float:
+        """Return how long not to open yet; 0 when it is time."""
+        return max(0.0, self._due_s - self._clock.monotonic())
+
+    def failed(self, reason: str) -> bool:
+        """Say so once, and wait longer each time. Returns True if *reason* is news."""
+        is_news = reason != self.trouble
+        if is_news:
+            log.error("%s: %s; trying again", self._name, reason)
+        self.trouble = reason
+        self._due_s = self._clock.monotonic() + self._after_s
+        self._after_s = min(MOST_S, 2 * self._after_s)
+        return is_news
+
+    def worked(self) -> None:
+        """The line is open and works."""
+        if self.trouble:
+            log.warning("%s: the line works again", self._name)
+        self.trouble, self._after_s = "", FIRST_S

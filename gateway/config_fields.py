@@ -1,0 +1,277 @@
+"""The types of the configuration's keys, and what is said to a person when a value does not fit.
+
+Strict: a whole number is an integer and nothing that looks like one; a time may be written 1 for 1.0, and is finite.
+Everything has bounds. Nothing here knows which keys there are (see ``config``) or what must fit together (see
+``config_checks``).
+
+Source: specification of rtugate, section 6; reference.toml for the limits.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from ipaddress import IPv6Address, ip_interface, ip_network
+from typing import Annotated, Any, Final, Literal, get_args
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+Path = tuple[str | int, ...]
+Severity = Literal["error", "warning", "note"]
+
+SECRETS: Final = frozenset({"password", "passphrase"})  # never shown, whatever is wrong with them
+SHOWN_CHARACTERS: Final = 60  # of a wrong text
+HINTS: Final = 100  # unknown keys that are compared with the known ones
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something wrong or worth knowing at *path*; the message names the key and says what is allowed."""
+
+    path: Path
+    message: str
+    severity: Severity = "error"
+
+
+def wrong(predicate: str) -> PydanticCustomError:
+    """The error of a value that *predicate* describes: "is not a network"; key and value are put before it."""
+    return PydanticCustomError("rtugate", "{predicate}", {"predicate": predicate})
+
+
+def _only_integers(value: object) -> object:
+    if type(value) is not int:  # a Literal takes true for 1 and 1.0 for 1
+        raise wrong("is not a whole number")
+    return value
+
+
+def _unit(number: int) -> int:
+    if number > 255:
+        raise wrong("is more than 247 (255 with framing tcp)")
+    return number
+
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise wrong("holds a character that cannot be printed")
+    return text
+
+
+def is_name(text: str) -> bool:
+    """Whether *text* may name a line, a request or an input."""
+    return re.fullmatch(r"[A-Za-z0-9_-]{1,32}", text) is not None
+
+
+def _name(text: str) -> str:
+    if not is_name(text):
+        raise wrong("is no name: 1 to 32 letters, digits, - and _")
+    return text
+
+
+def _device(text: str) -> str:
+    if text and not text.startswith("/"):
+        raise wrong("is not a device such as /dev/ttyS2")
+    return text
+
+
+def _line(text: str) -> str:
+    if text and not text.startswith("/") and _tcp_problem(text):
+        raise wrong(_tcp_problem(text))
+    return text
+
+
+def _tcp_problem(text: str) -> str:
+    if not text.startswith("tcp://"):
+        return "is neither a device such as /dev/ttyS2 nor tcp://host:port"
+    return "" if host_port(text, 0) else "is not tcp://host:port, with a port from 1 to 65535"
+
+
+def _listen(text: str) -> str:
+    if text and host_port(text, 0) is None:
+        raise wrong("is not host:port, with a port from 1 to 65535")
+    return text
+
+
+def _network(text: str) -> str:
+    try:
+        ip_network(text)
+    except ValueError:
+        raise wrong(_network_problem(text)) from None
+    return text
+
+
+def _network_problem(text: str) -> str:
+    try:
+        return f"is an address inside a network: the network is {ip_network(text, strict=False)}"
+    except ValueError:
+        return "is not a network such as 192.168.1.0/24"
+
+
+def _interface(text: str) -> str:
+    try:
+        if text != "dhcp":
+            ip_interface(text if "/" in text else "")
+    except ValueError:
+        raise wrong('is neither "dhcp" nor an address such as 192.168.1.50/24') from None
+    return text
+
+
+def _hash(text: str) -> str:
+    if text and not text.startswith("scrypt$"):
+        raise wrong("is not a hash: `rtugate passwd` makes one")
+    return text
+
+
+Name = Annotated[str, AfterValidator(_name)]
+Text = Annotated[str, Field(max_length=64), AfterValidator(_printable)]
+Device = Annotated[str, Field(max_length=255), AfterValidator(_printable), AfterValidator(_device)]
+LineText = Annotated[str, Field(max_length=255), AfterValidator(_printable), AfterValidator(_line)]
+Listen = Annotated[str, Field(max_length=255), AfterValidator(_listen)]
+Network = Annotated[str, AfterValidator(_network)]
+Interface = Annotated[str, AfterValidator(_interface)]
+PasswordHash = Annotated[str, Field(max_length=255), AfterValidator(_hash)]
+
+Seconds = Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False)]
+SomeSeconds = Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)]
+WholeSeconds = Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)]  # fractions allowed
+Cycle = Annotated[float, Field(ge=0.01, le=86400, allow_inf_nan=False)]
+Factor = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
+
+Unit = Annotated[int, Field(ge=0, json_schema_extra={"maximum": 255}), AfterValidator(_unit)]
+Address = Annotated[int, Field(ge=0, le=65535)]  # of a device or of the register: a point
+OptionalPoint = Annotated[int, Field(ge=-1, le=65535)]
+TableSize = Annotated[int, Field(ge=1, le=65536)]
+
+Baudrate = Annotated[
+    Literal[1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400],
+    BeforeValidator(_only_integers),
+]
+DataBits = Annotated[Literal[7, 8], BeforeValidator(_only_integers)]
+StopBits = Annotated[Literal[1, 2], BeforeValidator(_only_integers)]
+Parity = Literal["none", "even", "odd"]
+Framing = Literal["rtu", "ascii", "tcp"]
+
+_HOST_PORT: Final = re.compile(r"(?:tcp://)?(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
+
+
+def host_port(text: str, default_port: int) -> tuple[str, int] | None:
+    """Host (IPv6 without its brackets) and port of "tcp://host:port" or "host:port", or None if it is neither.
+
+    A *default_port* of 0 is only for asking whether the text is well-formed.
+    """
+    found = _HOST_PORT.fullmatch(text)
+    if found is None or (found[2] and not 1 <= int(found[2]) <= 65535):
+        return None
+    host = found[1]
+    if host.startswith("["):
+        host = host[1:-1]
+        try:
+            IPv6Address(host)
+        except ValueError:
+            return None
+    return host, int(found[2] or default_port)
+
+
+def shown(value: object) -> str:
+    """*value* as TOML would have it, made safe and short."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f'"{escaped(value)}"'
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"of {value.bit_length()} bits"
+    if isinstance(value, Mapping | list):
+        return "(a table)" if isinstance(value, Mapping) else "(a list)"
+    return str(value)
+
+
+def escaped(text: str) -> str:
+    """*text* without control characters, cut where it gets long."""
+    cut = text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> list[Finding]:
+    """Every error of *model*'s validation as a finding, in words of our own."""
+    details = error.errors(include_url=False)
+    return [_explain(detail, model, with_hint=n < HINTS) for n, detail in enumerate(details)]
+
+
+def _explain(detail: ErrorDetails, root: type[BaseModel], with_hint: bool) -> Finding:
+    path = detail["loc"]
+    key = next((str(part) for part in reversed(path) if isinstance(part, str)), "")
+    model = _model_at(root, path)
+    match detail["type"]:
+        case "missing":
+            allowed = model.model_fields[key].description
+            return Finding(path, f"{key} is missing: {allowed}")
+        case "extra_forbidden":
+            return Finding(path, _unknown(key, _keys(model) if with_hint else ()))
+        case "model_type":
+            return Finding(path, f"{key} must be a table")
+        case "list_type":
+            return Finding(path, _no_list(key, path, detail["input"]))
+    value = "***" if key in SECRETS else shown(detail["input"])
+    return Finding(path, f"{key} {value} {_predicate(detail)}")
+
+
+def _unknown(key: str, known: Iterable[str]) -> str:
+    close = get_close_matches(key, known, n=1) if len(key) < SHOWN_CHARACTERS else []
+    return f'unknown key "{escaped(key)}"' + (f'; did you mean "{close[0]}"?' if close else "")
+
+
+def _no_list(key: str, path: Path, value: object) -> str:
+    if isinstance(value, Mapping):
+        header = ".".join(part for part in path if isinstance(part, str))
+        return f"{key} must be written with double brackets: [[{header}]]"
+    return f"{key} {'***' if key in SECRETS else shown(value)} is not a list: put it in [ ]"
+
+
+def _expected(context: Mapping[str, Any]) -> str:
+    allowed = str(context["expected"]).replace(" or ", ", ").replace("'", '"')
+    return f"is not one of {allowed}"
+
+
+_PREDICATES: Final[dict[str, Callable[[Mapping[str, Any]], str]]] = {
+    "rtugate": lambda context: str(context["predicate"]),
+    "int_type": lambda _: "is not a whole number",
+    "float_type": lambda _: "is not a number",
+    "finite_number": lambda _: "is not a finite number",
+    "bool_type": lambda _: "is neither true nor false",
+    "string_type": lambda _: "is not a text: put it in quotes",
+    "literal_error": _expected,
+    "string_too_long": lambda context: f"is longer than {context['max_length']} characters",
+    "greater_than": lambda context: f"is not more than {context['gt']:g}",
+    "greater_than_equal": lambda context: f"is less than {context['ge']:g}",
+    "less_than_equal": lambda context: f"is more than {_plain(context['le'])}",
+}
+
+
+def _plain(limit: float) -> str:
+    return str(int(limit)) if limit == int(limit) else str(limit)
+
+
+def _predicate(detail: ErrorDetails) -> str:
+    if detail["type"] == "float_type" and type(detail["input"]) is int:
+        return "is too large"
+    words = _PREDICATES.get(detail["type"])
+    return words(detail.get("ctx", {})) if words else f"is wrong: {detail['msg']}"
+
+
+def _model_at(root: type[BaseModel], path: Path) -> type[BaseModel]:
+    """The model that holds the last key of *path*."""
+    model = root
+    for part in path[:-1]:
+        if isinstance(part, str):
+            fields = {field.alias or name: field for name, field in model.model_fields.items()}
+            annotation = fields[part].annotation
+            inner = next(iter(get_args(annotation)), annotation)
+            if isinstance(inner, type) and issubclass(inner, BaseModel):
+                model = inner
+    return model
+
+
+def _keys(model: type[BaseModel]) -> list[str]:
+    return [field.alias or name for name, field in model.model_fields.items()]

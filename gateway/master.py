@@ -1,0 +1,443 @@
+"""The master (client) of one line: commands first, then polls in turn (spec section 2).
+
+It asks, through a ``Line``, and carries what comes to the register. A line that cannot be opened, or is lost, is
+reported once and opened again with back-off. It never decides how bytes become frames, nor what a write is worth:
+those are ``transaction`` and ``commands``.
+
+Threads: one, which alone owns the link, the line and the schedule. ``submit``, ``wake`` and ``set_enabled`` may be
+called from any thread. ``step`` does one thing and waits no longer than *wait_limit_s*: it is what the tests drive.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from gateway.backoff import Backoff
+from gateway.clock import Clock
+from gateway.commands import Command, CommandQueue
+from gateway.config import MasterConfig
+from gateway.counters import PollCounters
+from gateway.errors import LinkError, QueueFull
+from gateway.link import Link, Waker, silence_s
+from gateway.modbus.pdu import Request, check_request
+from gateway.polls import OFFLINE_AFTER, Device, Poll, ProbeBudget, count_response, polls_of, status_span
+from gateway.register import DataRegister, Quality
+from gateway.schedule import Schedule
+from gateway.transaction import DAMAGED, TIMEOUT, Line, Response, Timing
+
+COMMANDS_IN_A_ROW: Final = 4  # then one poll goes through
+SUBMIT_LIMIT: Final = 16  # commands from the menu that wait
+SILENT_TCP_LIMIT: Final = 3  # requests in a row without any answer: a half-open connection, made anew
+PROBE_LEAST_S: Final = 0.1  # a probe that found nothing to send is not tried again without a pause
+STATUS_EVERY_S: Final = 1.0
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class Ticket:
+    """A command from the menu, and later its response."""
+
+    unit: int
+    request: Request
+    response: Response | None = None
+    done: threading.Event = field(default_factory=threading.Event)
+
+
+class Master:
+    """One ``[[master]]`` at work; a ``Task``."""
+
+    def __init__(
+        self,
+        config: MasterConfig,
+        register: DataRegister,
+        clock: Clock,
+        waker: Waker,
+        open_link: Callable[[], Link],
+        wait_limit_s: float = 3.0,
+    ) -> None:
+        """*open_link* opens the line, or raises LinkError; it may take a while but must heed *waker*."""
+        self.name = config.name
+        self.config = config
+        self.enabled = config.enabled
+        self.counters = PollCounters()
+        self.busy_s = 0.0  # of the line's time, silences and listening included
+        self.polls, self.devices = polls_of(config)
+        self._register = register
+        self._clock = clock
+        self._waker = waker
+        self._open_link = open_link
+        self._wait_limit_s = wait_limit_s
+        self._link: Link | None = None
+        self._line: Line | None = None
+        self._opening = Backoff(config.name, clock)
+        self._silent_in_row = 0
+        self._has_answered = False  # since the line was opened
+        scheduled = [poll for poll in self.polls if poll.is_scheduled]
+        self._schedule = Schedule([poll.config.every for poll in scheduled])
+        self._online = (1 << len(scheduled)) - 1
+        self._offline: set[Device] = set()
+        self._probes = ProbeBudget()
+        self._commands_in_row = 0
+        self._submitted: deque[Ticket] = deque()
+        self._status_s = 0.0
+        self._with_status = [poll for poll in self.polls if status_span(poll)]
+        self._stopping: Callable[[], bool] = lambda: False
+        self._alive: Callable[[], None] = lambda: None
+        self._queue = CommandQueue(register, clock, waker.wake)
+        self._undo: list[Callable[[], None]] = [self._queue.close]
+        self._by_outlet = {poll.outlet: poll for poll in self.polls if poll.outlet}
+        for poll in self.polls:
+            if poll.outlet:
+                self._queue.add(poll.outlet)
+            else:
+                self._undo.append(register.claim(poll.span, poll.source, poll.config.stale_after_used))
+
+    @property
+    def trouble(self) -> str:
+        """Why the line cannot be used, for people; "" while it can."""
+        return self._opening.trouble
+
+    # -------------------------------------------------------------------------------------------- from any thread
+
+    def wake(self) -> None:
+        """End any wait of this master's thread."""
+        self._waker.wake()
+
+    def set_enabled(self, enabled: bool) -> None:
+        """False: maintenance, nothing is sent and the port is let go; True: the line polls again."""
+        self.enabled = enabled
+        self.wake()
+
+    def submit(self, unit: int, request: Request) -> Ticket:
+        """Queue a command before all polls. Raises QueueFull, RequestInvalid; the ticket's event tells when done."""
+        check_request(request)
+        if len(self._submitted) >= SUBMIT_LIMIT:
+            raise QueueFull(f"{SUBMIT_LIMIT} commands wait for this line already")
+        ticket = Ticket(unit, request)
+        self._submitted.append(ticket)
+        self.wake()
+        return ticket
+
+    def state(self) -> str:
+        """Return what the line does, in one word or two."""
+        if not self.enabled:
+            return "maintenance"
+        line = self._line
+        return line.state.value if line else "no line"
+
+    # -------------------------------------------------------------------------------------------- the thread
+
+    def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
+        """Poll until *stop*; *alive* is called whenever something has been got on with."""
+        self._stopping, self._alive = stop.is_set, alive
+        try:
+            while not stop.is_set():
+                alive()
+                self.step()
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Let go of the line, the register's points and the commands."""
+        self._let_go()
+        for undo in self._undo:
+            undo()
+        self._undo.clear()
+
+    def step(self) -> None:
+        """Do one thing: a command, a poll, a probe, opening the line; or wait for the next."""
+        self._expire()
+        self._show_status()
+        if not self.enabled:
+            self._let_go()
+            self._waker.wait(self._wait_s())
+        elif self._line is None:
+            self._open()
+        else:
+            try:
+                self._work(self._line)
+            except LinkError as error:
+                self._broke(str(error))
+
+    def _work(self, line: Line) -> None:
+        if self.config.is_tcp and self._silent_in_row >= SILENT_TCP_LIMIT:
+            self._renew("nothing answers")
+            return
+        if self._carry_out_command(line) or self._carry_out_probe(line) or self._carry_out_poll(line):
+            return
+        line.advance(self._wait_s())
+
+    def _wait_s(self) -> float:
+        """How long nothing is due."""
+        due_s = [self._clock.monotonic() + self._wait_limit_s]
+        if self.enabled and self._line is not None:
+            due_s.append(self._schedule.next_due_s() or due_s[0])
+            if self._offline:
+                due_s.append(self._probes.due_s())
+        due_s.append(self._queue.next_expiry_s() or due_s[0])
+        if self._with_status:
+            due_s.append(self._status_s)
+        return max(0.0, min(due_s) - self._clock.monotonic())
+
+    # -------------------------------------------------------------------------------------------- the line
+
+    def _open(self) -> None:
+        wait_s = self._opening.wait_s()
+        if wait_s:
+            self._waker.wait(min(self._wait_s(), wait_s))
+            return
+        try:
+            self._link = self._open_link()
+        except LinkError as error:
+            self._lost(str(error))
+            return
+        self._line = Line(self._link, self.config.framing_used, self._timing(self._link), self._clock)
+        self._silent_in_row = 0
+        self._has_answered = False
+        if not self.config.is_tcp:  # a connection has to prove itself by an answer
+            self._opening.worked()
+
+    def _timing(self, link: Link) -> Timing:
+        config = self.config
+        return Timing(
+            config.response_timeout,
+            config.character_timeout_used,
+            0.0 if config.is_tcp else silence_s(config.baudrate, link.character_s),
+            config.delay,
+            config.turnaround,
+            link.character_s,
+        )
+
+    def _broke(self, reason: str) -> None:
+        """A connection that worked is made anew at once: devices close idle ones. Another is in trouble."""
+        if self._has_answered:
+            self._renew(reason)
+        else:
+            self._lost(reason)
+
+    def _renew(self, reason: str) -> None:
+        log.debug("%s: %s; opening it anew", self.name, reason)
+        self._let_go()
+
+    def _lost(self, reason: str) -> None:
+        """The line is not to be had: say so once, spoil all points, try again later and later."""
+        self._let_go()
+        if self._opening.failed(reason):
+            for poll in self.polls:
+                if poll.config.is_read:
+                    poll.spoil(self._register)
+                    poll.last_error = TIMEOUT
+
+    def _let_go(self) -> None:
+        if self._link is not None:
+            self._link.close()
+        self._link = self._line = None
+
+    # -------------------------------------------------------------------------------------------- what is next
+
+    def _carry_out_command(self, line: Line) -> bool:
+        if self._commands_in_row >= COMMANDS_IN_A_ROW and self._poll_due() is not None:
+            return False
+        if self._submitted:
+            self._carry_out_ticket(line, self._submitted.popleft())
+        else:
+            held_back = {outlet for device in self._offline for outlet in device.outlets}
+            command = self._queue.take(held_back)
+            if command is None:
+                return False
+            self._send_command(line, command)
+        self._commands_in_row += 1
+        return True
+
+    def _carry_out_probe(self, line: Line) -> bool:
+        """Try one offline device, if the budget allows: with a command that waits for it, else with a poll."""
+        began_s = self._clock.monotonic()
+        if not self._offline or began_s < self._probes.due_s():
+            return False
+        device = self._probes.pick(self._offline)
+        others = {outlet for outlet in self._by_outlet if outlet not in device.outlets}
+        command = self._queue.take(others)
+        if command is not None:
+            self._send_command(line, command)
+        elif device.polls:
+            index = self._schedule.pick(began_s, device.polls)
+            self._send_poll(line, _first_bit(device.polls) if index is None else index)
+        while not line.is_free and not self._stopping():
+            self._alive()
+            line.advance(self._wait_limit_s)
+        self._probes.spent(began_s, max(self._clock.monotonic(), began_s + PROBE_LEAST_S))
+        return True
+
+    def _carry_out_poll(self, line: Line) -> bool:
+        index = self._poll_due()
+        if index is None:
+            return False
+        self._commands_in_row = 0
+        self._send_poll(line, index)
+        return True
+
+    def _poll_due(self) -> int | None:
+        return self._schedule.pick(self._clock.monotonic(), self._online)
+
+    # -------------------------------------------------------------------------------------------- sending
+
+    def _send_poll(self, line: Line, index: int) -> None:
+        poll = self.polls[index]
+        overruns = self._schedule.sent(index, self._clock.monotonic())
+        if not poll.device.is_offline:
+            poll.counters.overruns += overruns
+            self.counters.overruns += overruns
+        number, data = 0, None
+        if poll.outlet is not None:
+            values = self._queue.cyclic_values(poll.outlet)
+            if values is None:  # nobody has written all of its points yet
+                return
+            data, number = values
+        response = self._ask(line, poll, poll.request(data))
+        if response is None:
+            return
+        self._take_outcome(poll, index, number, response)
+        self._show(poll)
+
+    def _take_outcome(self, poll: Poll, index: int, number: int, response: Response) -> None:
+        if response.has_error():
+            self._poll_failed(poll, index, response)
+        elif poll.outlet is not None:
+            self._queue.delivered(poll.outlet, number)
+            self._poll_succeeded(poll)
+        else:
+            self._register.write(poll.span, response.data, poll.source)
+            self._poll_succeeded(poll)
+
+    def _poll_succeeded(self, poll: Poll) -> None:
+        poll.failed_tries = 0
+        if poll.is_bad:
+            poll.is_bad = False
+            log.info("%s: good again", poll.source)
+            if poll.outlet is not None:
+                self._register.mark(poll.span, Quality.GOOD, poll.source)
+
+    def _poll_failed(self, poll: Poll, index: int, response: Response) -> None:
+        poll.failed_tries += 1
+        is_silent = response.error_code in (TIMEOUT, DAMAGED)
+        if is_silent and poll.failed_tries <= self.config.retries and not poll.device.is_offline:
+            self._schedule.at_once(1 << index)
+            return
+        poll.failed_tries = 0
+        if not poll.is_bad and not poll.device.is_offline:
+            log.warning("%s: %s", poll.source, response.reason)
+        poll.spoil(self._register)
+
+    def _send_command(self, line: Line, command: Command) -> None:
+        poll = self._by_outlet[command.outlet]
+        try:
+            response = self._ask(line, poll, poll.command(command))
+        except LinkError:
+            self._queue.put_back(command)
+            raise
+        if response is None or response.error_code in (TIMEOUT, DAMAGED):
+            self._queue.put_back(command)
+        elif response.has_error():
+            log.warning("%s: point %d not written: %s", poll.source, command.span.start, response.reason)
+            poll.is_bad = True
+            self._queue.drop(command)
+        else:
+            poll.is_bad = False
+            self._queue.answered(command)
+        self._show(poll)
+
+    def _carry_out_ticket(self, line: Line, ticket: Ticket) -> None:
+        self.counters.sent += 1
+        try:
+            ticket.response = self._transact(line, ticket.unit, ticket.request, None)
+        finally:
+            ticket.done.set()
+        if ticket.response is not None:
+            count_response(self.counters, ticket.response)
+
+    def _ask(self, line: Line, poll: Poll, request: Request) -> Response | None:
+        """Send *request* and wait for what becomes of it; None when stopped on the way."""
+        poll.counters.sent += 1
+        self.counters.sent += 1
+        response = self._transact(line, poll.device.unit, request, poll.timeout_s)
+        if response is not None:
+            poll.count(response, self._clock.monotonic())
+            count_response(self.counters, response)
+            self._judge(poll.device, response)
+        return response
+
+    def _transact(self, line: Line, unit: int, request: Request, timeout_s: float | None) -> Response | None:
+        began_s = self._clock.monotonic()
+        line.send(unit, request, timeout_s)
+        response = None
+        while response is None and not self._stopping():
+            response = line.advance(self._wait_limit_s)
+            self._alive()
+        self.busy_s += self._clock.monotonic() - began_s
+        if response is not None:
+            is_silent = response.error_code == TIMEOUT
+            self._silent_in_row = self._silent_in_row + 1 if is_silent else 0
+            if not is_silent and not self._has_answered:
+                self._has_answered = True
+                self._opening.worked()
+        return response
+
+    # -------------------------------------------------------------------------------------------- devices
+
+    def _judge(self, device: Device, response: Response) -> None:
+        """Only silence and damaged replies count against a device: an exception proves it alive."""
+        if response.error_code not in (TIMEOUT, DAMAGED):
+            device.failures_in_row = 0
+            if device.is_offline:
+                self._back(device)
+            return
+        device.failures_in_row += 1
+        if device.failures_in_row >= OFFLINE_AFTER and not device.is_offline:
+            log.warning("%s: unit %d is offline: %s", self.name, device.unit, response.reason)
+            device.is_offline = True
+            self._offline.add(device)
+            self._online &= ~device.polls
+            for poll in self.polls:
+                if poll.device is device:
+                    poll.spoil(self._register)
+
+    def _back(self, device: Device) -> None:
+        log.warning("%s: unit %d is back", self.name, device.unit)
+        device.is_offline = False
+        self._offline.discard(device)
+        self._online |= device.polls
+        self._schedule.at_once(device.polls)
+
+    # -------------------------------------------------------------------------------------------- by the way
+
+    def _expire(self) -> None:
+        for command in self._queue.expire():
+            poll = self._by_outlet[command.outlet]
+            poll.counters.expired += 1
+            self.counters.expired += 1
+            log.warning("%s: point %d not written: not delivered in time", poll.source, command.span.start)
+
+    def _show_status(self) -> None:
+        """Keep the status points up to date: once a second."""
+        now_s = self._clock.monotonic()
+        if now_s < self._status_s:
+            return
+        self._status_s = now_s + STATUS_EVERY_S
+        for poll in self._with_status:
+            self._show(poll)
+
+    def _show(self, poll: Poll) -> None:
+        span = status_span(poll)
+        if span is not None:
+            status = poll.status(self._clock.monotonic(), not self.enabled)
+            self._register.write(span, status, poll.source)
+
+
+def _first_bit(bits: int) -> int:
+    return (bits & -bits).bit_length() - 1

@@ -1,0 +1,197 @@
+"""A master's requests and devices as they run: what is asked, and what becomes of the points (spec section 2).
+
+``Poll`` is one request of the configuration with its place in the register, its counters and its state; ``Device`` is
+one unit of a line, alive or offline; ``ProbeBudget`` says when an offline device may be tried. None of them sends
+anything or knows the time: ``master.py`` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Final
+
+from gateway.commands import Command, Outlet
+from gateway.config import MasterConfig, RequestConfig
+from gateway.counters import PollCounters
+from gateway.modbus.pdu import ReadRequest, Request, Span, Table, WriteRequest, pack_words
+from gateway.register import DataRegister, Quality, Source, SourceKind
+from gateway.transaction import DAMAGED, NO_ERROR, TIMEOUT, Response
+
+OFFLINE_AFTER: Final = 3  # failures in a row
+PROBE_SHARE: Final = 11  # one part probing, ten parts polling: 9.1 % of the line's time, at most 10 % is allowed
+PROBE_AT_LEAST_EVERY_S: Final = 60.0
+STATUS_COUNT: Final = 4  # input registers of a status_point
+AGE_MAX_S: Final = 65535
+
+
+class Status(IntEnum):
+    """The first register of a status_point (spec section 3)."""
+
+    NEVER = 0
+    GOOD = 1
+    BAD = 2
+    STALE = 3
+    OFFLINE = 4
+    MAINTENANCE = 5
+
+
+@dataclass(eq=False)
+class Device:
+    """One unit on the line. *polls*: its scheduled requests as bits; *outlets*: its writes."""
+
+    unit: int
+    failures_in_row: int = 0
+    is_offline: bool = False
+    polls: int = 0
+    outlets: set[Outlet] = field(default_factory=set)
+
+
+@dataclass(eq=False)
+class Poll:
+    """One request, as configured, and what has become of it so far."""
+
+    config: RequestConfig
+    device: Device
+    source: Source
+    timeout_s: float
+    outlet: Outlet | None = None  # writes only
+    counters: PollCounters = field(default_factory=PollCounters)
+    failed_tries: int = 0
+    is_bad: bool = False
+    last_good_s: float | None = None
+    last_error: int = NO_ERROR
+
+    @property
+    def span(self) -> Span:
+        """Its points in the register."""
+        return Span(self.config.target, self.config.point, self.config.count)
+
+    @property
+    def is_scheduled(self) -> bool:
+        """True for what is sent by cycle; False for what is only sent on change."""
+        return self.config.is_read or self.config.trigger == "cycle"
+
+    def request(self, data: bytes | None) -> Request:
+        """Return what is asked: of a read, or of a write with all of its *data*."""
+        if self.config.is_read:
+            return ReadRequest(self.config.code, self.config.address, self.config.count)
+        return WriteRequest(self.config.code, self.config.address, self.config.count, data or b"")
+
+    def command(self, command: Command) -> Request:
+        """Return the write of just the points that *command* carries."""
+        address = self.config.address + command.span.start - self.config.point
+        return WriteRequest(self.config.code, address, command.span.count, command.data or b"")
+
+    def status(self, now_s: float, maintenance: bool) -> bytes:
+        """Return the 4 input registers of its status_point: state, age in s, failures, last error."""
+        age_s = AGE_MAX_S if self.last_good_s is None else min(AGE_MAX_S, int(now_s - self.last_good_s))
+        state = Status.MAINTENANCE if maintenance else self._state(now_s)
+        return pack_words([state, age_s, self.counters.failures & 0xFFFF, self.last_error])
+
+    def _state(self, now_s: float) -> Status:
+        if self.device.is_offline:
+            return Status.OFFLINE
+        if self.is_bad:
+            return Status.BAD
+        if self.last_good_s is None:
+            return Status.NEVER
+        is_old = self.config.is_read and now_s - self.last_good_s > self.config.stale_after_used
+        return Status.STALE if is_old else Status.GOOD
+
+    def count(self, response: Response, now_s: float) -> None:
+        """Take *response* into the counters."""
+        self.last_error = response.error_code
+        count_response(self.counters, response)
+        if not response.has_error():
+            self.last_good_s = now_s
+
+    def spoil(self, register: DataRegister) -> None:
+        """Its points are bad; a read with ``on_failure = "zero"`` also gives zeros."""
+        self.is_bad = True
+        if self.config.is_read and self.config.on_failure == "zero":
+            register.write(self.span, bytes(self.span.size), self.source, Quality.BAD)
+        else:
+            register.mark(self.span, Quality.BAD, self.source)
+
+
+def count_response(counters: PollCounters, response: Response) -> None:
+    """Take *response* into *counters*."""
+    if response.error_code == TIMEOUT:
+        counters.timeouts += 1
+    elif response.error_code == DAMAGED:
+        counters.damaged += 1
+    elif response.has_error():
+        counters.exceptions[response.error_code] += 1
+    else:
+        counters.good += 1
+    if response.error_code not in (TIMEOUT, DAMAGED):
+        counters.times.add(response.reply_s)
+
+
+def polls_of(master: MasterConfig) -> tuple[list[Poll], dict[int, Device]]:
+    """Return the enabled requests of *master*, those sent by cycle first, and its devices by unit.
+
+    The bit of a scheduled request in ``Device.polls`` is its place in the list.
+    """
+    devices: dict[int, Device] = {}
+    enabled = [request for request in master.request if request.enabled]
+    polls: list[Poll] = []
+    for request in sorted(enabled, key=lambda r: not r.is_read and r.trigger == "change"):
+        device = devices.setdefault(request.unit, Device(request.unit))
+        source = Source(SourceKind.REQUEST, f"{master.name}/{request.title}")
+        poll = Poll(request, device, source, master.response_timeout_of(request))
+        if poll.is_scheduled:
+            device.polls |= 1 << len(polls)
+        if not request.is_read:
+            poll.outlet = _outlet(poll, enabled)
+            device.outlets.add(poll.outlet)
+        polls.append(poll)
+    return polls, devices
+
+
+def _outlet(poll: Poll, requests: Sequence[RequestConfig]) -> Outlet:
+    config = poll.config
+    filled_by_same_device = any(
+        other.is_read and other.unit == config.unit and Span(other.target, other.point, other.count).overlaps(poll.span)
+        for other in requests
+    )
+    return Outlet(
+        poll.span,
+        poll.source,
+        on_change=config.trigger == "change",
+        whole=config.whole,
+        commanded_only=config.trigger == "cycle" and filled_by_same_device,
+        expire_s=config.expire,
+    )
+
+
+def status_span(poll: Poll) -> Span | None:
+    """Return where the request's status goes, or None."""
+    point = poll.config.status_point
+    return Span(Table.INPUT_REGISTERS, point, STATUS_COUNT) if point >= 0 else None
+
+
+class ProbeBudget:
+    """When the next offline device may be tried: one at a time, in turn, at most 10 % of the line's time."""
+
+    def __init__(self) -> None:
+        self._next_s = 0.0
+        self._last_unit = -1
+
+    def due_s(self) -> float:
+        """Return from when on a probe may be sent (monotonic seconds)."""
+        return self._next_s
+
+    def pick(self, offline: Collection[Device]) -> Device:
+        """Return the offline device whose turn it is; *offline* has at least one."""
+        ordered = sorted(offline, key=lambda device: device.unit)
+        device = next((d for d in ordered if d.unit > self._last_unit), ordered[0])
+        self._last_unit = device.unit
+        return device
+
+    def spent(self, began_s: float, free_s: float) -> None:
+        """A probe took the line from *began_s* until it is free again at *free_s*, listening included."""
+        share_s = (free_s - began_s) * PROBE_SHARE
+        self._next_s = began_s + min(share_s, max(PROBE_AT_LEAST_EVERY_S, free_s - began_s))

@@ -1,0 +1,167 @@
+"""The TOML file: loaded as a configuration, with the line of everything that is said about it.
+
+Loading changes nothing on the disk and never falls back to anything: a file that cannot be used is a ``ConfigError``
+that carries every finding, whatever the bytes in it. Saving is to come.
+
+Source: specification of rtugate, section 6. Any thread; nothing is shared.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from gateway import config_fields, toml_text
+from gateway.config import Config
+from gateway.config_checks import not_yet, validate
+from gateway.config_fields import Finding, Severity
+from gateway.errors import ConfigError
+
+LARGEST_FILE_BYTES: Final = 1024 * 1024
+BYTE_ORDER_MARK: Final = "\ufeff"
+
+_TOML_PLACE: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+_PLAIN_WORDS: Final = {  # what tomllib says of the commonest slips
+    "Cannot overwrite a value": "this key is given twice",
+    "Invalid value": "this is no value: a text stands in quotes",
+    "Expected '=' after a key in a key/value pair": "a key is followed by = and a value",
+    "Illegal character '\\n'": "the quotes of this text are not closed",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LocatedFinding:
+    """A finding with its place in the file; ``str()`` makes the line that a person reads.
+
+    line:    counted from 1; None where the file as a whole is meant.
+    subject: the entry or table, as a person names it: `master "field", request "boiler"`; "" for the whole file.
+    """
+
+    file_name: str
+    line: int | None
+    subject: str
+    message: str
+    severity: Severity = "error"
+
+    def __str__(self) -> str:
+        place = self.file_name if self.line is None else f"{self.file_name}:{self.line}"
+        severity = "" if self.severity == "error" else self.severity
+        return ": ".join(part for part in (place, severity, self.subject, self.message) if part)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A configuration that can be used, the text it came from, and the warnings and notes about it."""
+
+    config: Config
+    text: str
+    findings: list[LocatedFinding]
+
+
+def load(path: Path) -> Loaded:
+    """Return the configuration in the file at *path*; raises ConfigError with every finding."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE_BYTES + 1)
+    except OSError as error:
+        raise _unusable(path.name, None, f"cannot be read: {error.strerror or error}") from error
+    return load_text(content, path.name)
+
+
+def load_text(text: str | bytes, file_name: str) -> Loaded:
+    """Return the configuration in *text*, which messages call *file_name*; raises ConfigError with every finding."""
+    if len(text) > LARGEST_FILE_BYTES:
+        raise _unusable(file_name, None, "is larger than 1 MiB")
+    decoded = _decode(text, file_name) if isinstance(text, bytes) else text
+    statements = toml_text.scan(decoded)
+    data = _parse(decoded, statements, file_name)
+    config, found = validate(data)
+    if config is None:
+        raise ConfigError(_locate(found, data, statements, file_name))
+    return Loaded(config, decoded, _locate(found + not_yet(config), data, statements, file_name))
+
+
+def _unusable(file_name: str, line: int | None, message: str) -> ConfigError:
+    return ConfigError([LocatedFinding(file_name, line, "", message)])
+
+
+def _decode(content: bytes, file_name: str) -> str:
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise _unusable(file_name, line, "this is not UTF-8: save the file in that encoding") from error
+
+
+def _parse(text: str, statements: list[toml_text.Statement], file_name: str) -> dict[str, Any]:
+    if text.startswith(BYTE_ORDER_MARK):
+        raise _unusable(file_name, 1, "the file starts with a byte order mark: save it as UTF-8 without one")
+    deep = next((one for one in statements if len(one.path) > toml_text.DEEPEST), None)
+    if deep is not None:  # before tomllib, which takes the square of the depth
+        raise _unusable(file_name, deep.line, f"nested more than {toml_text.DEEPEST} deep")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        line, message = _in_plain_words(str(error), text)
+        raise _unusable(file_name, line, message) from error
+    except RecursionError as error:
+        raise _unusable(file_name, None, "nested too deep") from error
+    except ValueError as error:  # Python's own limit on digits; a date that does not exist
+        raise _unusable(file_name, None, f"a value is out of all bounds ({str(error).split(':')[0]})") from error
+
+
+def _in_plain_words(text: str, document: str) -> tuple[int, str]:
+    """Line and message of what tomllib says in one text: "Invalid value (at line 3, column 5)"."""
+    place = _TOML_PLACE.search(text)
+    said = text[: place.start()] if place else text
+    if said.startswith("Cannot declare"):
+        said = "this table is given twice"
+    words = _PLAIN_WORDS.get(said, said)
+    if place is None or place[1] is None:
+        return document.rstrip("\n").count("\n") + 1, f"not TOML: {words}, at the end of the file"
+    return int(place[1]), f"not TOML: {words} (column {place[2]})"
+
+
+def _locate(
+    found: Iterable[Finding], data: Mapping[str, Any], statements: list[toml_text.Statement], file_name: str
+) -> list[LocatedFinding]:
+    places = toml_text.Places(statements)
+    located = [
+        LocatedFinding(file_name, places.line(one.path), _subject(one.path, data), one.message, one.severity)
+        for one in found
+    ]
+    return sorted(located, key=lambda finding: finding.line or 0)
+
+
+def _subject(path: config_fields.Path, data: Mapping[str, Any]) -> str:
+    """What *path* lies in, as a person names it."""
+    if len(path) > 1 and isinstance(path[1], int):
+        entries = [_entry_name(path[:2], data)]
+        if len(path) > 3 and isinstance(path[3], int) and path[2] == "request":
+            entries.append(_entry_name(path[:4], data))
+        return ", ".join(entries)
+    tables = [str(part) for part in path if isinstance(_value(path[: path.index(part) + 1], data), Mapping)]
+    return f"[{'.'.join(config_fields.escaped(table) for table in tables)}]" if tables else ""
+
+
+def _entry_name(path: config_fields.Path, data: Mapping[str, Any]) -> str:
+    """`request "boiler"`, or `request 3` where there is no sound name."""
+    entry = _value(path, data)
+    name = entry.get("name") if isinstance(entry, Mapping) else None
+    kind, index = path[-2:]
+    is_sound = isinstance(name, str) and config_fields.is_name(name)
+    return f'{kind} "{name}"' if is_sound else f"{kind} {int(index) + 1}"
+
+
+def _value(path: config_fields.Path, data: Any) -> Any:
+    """What stands at *path* in the parsed file, or None."""
+    for part in path:
+        try:
+            data = data[part]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return data
