@@ -81,7 +81,6 @@ NATURAL_TABLES: Final = {  # the table whose points a request carries, by functi
     16: Table.HOLDING_REGISTERS,
 }
 MODBUS_PORT: Final = 502  # Modbus Messaging on TCP/IP Implementation Guide V1.0b, section 3.1.3
-TELNET_PORT: Final = 23
 
 
 def _code_in(known: dict[str, int], value: object) -> object:
@@ -242,7 +241,7 @@ class LineConfig(Section):
     @property
     def address(self) -> tuple[str, int]:
         """Host and port of a tcp:// line; raises ValueError on any other."""
-        found = host_port(self.line, MODBUS_PORT) if self.is_tcp else None
+        found = host_port(self.line.removeprefix("tcp://"), MODBUS_PORT) if self.is_tcp else None
         if found is None:
             raise ValueError(f"{self.line} is no tcp:// line")
         return found
@@ -356,7 +355,7 @@ class HmiTelnetConfig(Section):
     @property
     def address(self) -> tuple[str, int] | None:
         """Host and port, or None without telnet."""
-        return host_port(self.listen, TELNET_PORT) if self.listen else None
+        return host_port(self.listen, None)
 
 
 class HmiWiflyConfig(Section):

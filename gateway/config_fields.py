@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from ipaddress import IPv6Address, ip_interface, ip_network
+from ipaddress import ip_address, ip_interface, ip_network
 from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
@@ -77,19 +77,18 @@ def _device(text: str) -> str:
 
 
 def _line(text: str) -> str:
-    if text and not text.startswith("/") and _tcp_problem(text):
-        raise wrong(_tcp_problem(text))
+    host = text.removeprefix("tcp://")
+    if text.startswith("/") or not text:
+        return text
+    if host == text:
+        raise wrong("is neither a device such as /dev/ttyS2 nor tcp://host:port")
+    if host_port(host, 1) is None:
+        raise wrong("is not tcp://host:port, with a port from 1 to 65535")
     return text
 
 
-def _tcp_problem(text: str) -> str:
-    if not text.startswith("tcp://"):
-        return "is neither a device such as /dev/ttyS2 nor tcp://host:port"
-    return "" if host_port(text, 0) else "is not tcp://host:port, with a port from 1 to 65535"
-
-
 def _listen(text: str) -> str:
-    if text and host_port(text, 0) is None:
+    if text and host_port(text, None) is None:
         raise wrong("is not host:port, with a port from 1 to 65535")
     return text
 
@@ -153,25 +152,25 @@ StopBits = Annotated[Literal[1, 2], BeforeValidator(_only_integers)]
 Parity = Literal["none", "even", "odd"]
 Framing = Literal["rtu", "ascii", "tcp"]
 
-_HOST_PORT: Final = re.compile(r"(?:tcp://)?(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
+_HOST_PORT: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
 
 
-def host_port(text: str, default_port: int) -> tuple[str, int] | None:
-    """Host (IPv6 without its brackets) and port of "tcp://host:port" or "host:port", or None if it is neither.
+def host_port(text: str, default_port: int | None) -> tuple[str, int] | None:
+    """Host (IPv6 without its brackets) and port of "host:port", or None if *text* is nothing of the kind.
 
-    A *default_port* of 0 is only for asking whether the text is well-formed.
+    A *default_port* of None: the port must be there. Names are not looked up.
     """
     found = _HOST_PORT.fullmatch(text)
-    if found is None or (found[2] and not 1 <= int(found[2]) <= 65535):
+    port = int(found[2]) if found and found[2] else default_port
+    if found is None or port is None or not 1 <= port <= 65535:
         return None
-    host = found[1]
-    if host.startswith("["):
-        host = host[1:-1]
+    host = found[1].strip("[]")
+    if found[1].startswith("[") or re.fullmatch(r"[0-9.]+", host):
         try:
-            IPv6Address(host)
+            ip_address(host)
         except ValueError:
             return None
-    return host, int(found[2] or default_port)
+    return host, port
 
 
 def shown(value: object) -> str:
@@ -210,7 +209,7 @@ def _explain(detail: ErrorDetails, root: type[BaseModel], with_hint: bool) -> Fi
         case "extra_forbidden":
             return Finding(path, _unknown(key, _keys(model) if with_hint else ()))
         case "model_type":
-            return Finding(path, f"{key} must be a table")
+            return Finding(path, f"{key} must be a table" + ("" if path[-1] != key else f": [{_header(path)}]"))
         case "list_type":
             return Finding(path, _no_list(key, path, detail["input"]))
     value = "***" if key in SECRETS else shown(detail["input"])
@@ -222,10 +221,13 @@ def _unknown(key: str, known: Iterable[str]) -> str:
     return f'unknown key "{escaped(key)}"' + (f'; did you mean "{close[0]}"?' if close else "")
 
 
+def _header(path: Path) -> str:
+    return ".".join(part for part in path if isinstance(part, str))
+
+
 def _no_list(key: str, path: Path, value: object) -> str:
     if isinstance(value, Mapping):
-        header = ".".join(part for part in path if isinstance(part, str))
-        return f"{key} must be written with double brackets: [[{header}]]"
+        return f"{key} must be written with double brackets: [[{_header(path)}]]"
     return f"{key} {'***' if key in SECRETS else shown(value)} is not a list: put it in [ ]"
 
 

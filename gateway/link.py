@@ -315,7 +315,7 @@ def open_serial(settings: SerialSettings, waker: Waker, clock: Clock) -> Link:
     port = serial.Serial(timeout=0, exclusive=True)  # opens with O_NONBLOCK: no wait for a carrier
     try:
         port.port = settings.device
-        port.rts = settings.rs485 != "rts"  # opening alone must not drive an RS-485 pair
+        port.rts = settings.rs485 == "none"  # the kernel raises RTS at opening: drive an RS-485 pair no longer
         port.open()
         _set_rs485(port, settings)
         _set_format(port.fileno(), settings)

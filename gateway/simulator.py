@@ -6,8 +6,8 @@ here uses our framing or our server. What a device holds is a `Device`; who carr
 It refuses to listen beyond 127.0.0.1, to keep the speed of a real line (a pty has none), and to be a model of
 conformance: odd requests get what pymodbus gives them. A unit that is not there is silent, on TCP too.
 
-Source: spec section 9 (`demo`, `simulate`); pymodbus 3.8.6 and 3.16, whose servers differ in how they ask for data:
-`_Bus` has both faces.
+Source: spec section 9 (`demo`, `simulate`); pymodbus 3.8.6, 3.11 and 3.16, whose servers differ in how they ask for
+data: `_Bus` and `_Unit` have every face.
 
 Threads: one, "simulator", with one asyncio loop: servers, ptys and `moves` live there. `Simulator` is called from
 any one other thread, `Device.get`, `set` and `silent` from any number.
@@ -20,6 +20,7 @@ import contextlib
 import logging
 import math
 import os
+import struct
 import threading
 import tty
 from collections import deque
@@ -29,7 +30,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from pymodbus.framer import FramerType
+from pymodbus.framer import FramerAscii, FramerType
 from pymodbus.pdu import ExceptionResponse
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 
@@ -39,13 +40,14 @@ from gateway.modbus.pdu import Table
 # A server is built around a context that `_Bus` replaces at once; 3.16 wants a device in it, 3.8 takes nothing.
 try:
     from pymodbus.constants import ExcCodes
-    from pymodbus.simulator import DataType, SimData, SimDevice
+    from pymodbus.simulator import SimData, SimDevice
 except ImportError:
     _ILLEGAL_ADDRESS: int = 2
+    _NO_SUCH_POINTS: Any = []
     _PLACEHOLDER: Any = None
 else:
-    _ILLEGAL_ADDRESS = ExcCodes.ILLEGAL_ADDRESS
-    _PLACEHOLDER = SimDevice(1, SimData(0, datatype=DataType.REGISTERS))
+    _ILLEGAL_ADDRESS = _NO_SUCH_POINTS = ExcCodes.ILLEGAL_ADDRESS
+    _PLACEHOLDER = SimDevice(1, [SimData(0)])
 
 TICK_S = 0.2
 WRITES_KEPT = 10_000
@@ -124,7 +126,7 @@ class Device:
 
 
 class _Unit:
-    """A device as pymodbus 3.8 wants to see it: validate, then get or set."""
+    """A device as pymodbus up to 3.11 sees it; in 3.8 it validates first, except before it reads bits."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -132,22 +134,22 @@ class _Unit:
     def validate(self, function: int, address: int, count: int = 1) -> bool:
         return self._device.has(_TABLE_OF_FUNCTION[function], address, count)
 
-    async def async_getValues(  # noqa: N802 (pymodbus's name)
-        self, function: int, address: int, count: int = 1
-    ) -> list[int]:
-        """Return the values; none where there are no such points, see `_Bus.trace`."""
-        table = _TABLE_OF_FUNCTION[function]
-        exist = self._device.has(table, address, count)
-        return self._device.get(table, address, count) if exist else []
+    async def async_getValues(self, function: int, address: int, count: int = 1) -> Any:  # noqa: N802 (pymodbus's name)
+        """Return the values, or what tells pymodbus that there are no such points."""
+        if not self.validate(function, address, count):
+            return _NO_SUCH_POINTS
+        return self._device.get(_TABLE_OF_FUNCTION[function], address, count)
 
-    async def async_setValues(  # noqa: N802 (pymodbus's name)
-        self, function: int, address: int, values: Sequence[int]
-    ) -> None:
+    async def async_setValues(self, function: int, address: int, values: Sequence[int]) -> Any:  # noqa: N802
+        """Store the values and return None, or the exception code."""
+        if not self.validate(function, address, len(values)):
+            return _ILLEGAL_ADDRESS
         self._device.receive(_TABLE_OF_FUNCTION[function], address, values)
+        return None
 
 
 class _Bus:
-    """The devices of one line, as the context of a pymodbus server; both faces of it, and the line's silence."""
+    """The devices of one line, as the context of a pymodbus server (3.8 to 3.11 ask a unit), and the line's silence."""
 
     def __init__(self, devices: Sequence[Device], broadcasts: bool) -> None:
         self._broadcasts = broadcasts
@@ -164,21 +166,11 @@ class _Bus:
     def __getitem__(self, unit: int) -> _Unit:
         return _Unit(self._devices[unit])
 
-    async def async_getValues(  # noqa: N802 (pymodbus's name)
-        self, unit: int, function: int, address: int, count: int = 1
-    ) -> list[int] | int:
-        """3.16: return the values, or the exception code."""
-        values = await self[unit].async_getValues(function, address, count)
-        return values or _ILLEGAL_ADDRESS
+    async def async_getValues(self, unit: int, function: int, address: int, count: int = 1) -> Any:  # noqa: N802
+        return await self[unit].async_getValues(function, address, count)
 
-    async def async_setValues(  # noqa: N802 (pymodbus's name)
-        self, unit: int, function: int, address: int, values: Sequence[int]
-    ) -> int | None:
-        """3.16: store the values and return None, or the exception code."""
-        if not self[unit].validate(function, address, len(values)):
-            return _ILLEGAL_ADDRESS
-        await self[unit].async_setValues(function, address, values)
-        return None
+    async def async_setValues(self, unit: int, function: int, address: int, values: Sequence[int]) -> Any:  # noqa: N802
+        return await self[unit].async_setValues(function, address, values)
 
     def trace(self, sending: bool, pdu: Any) -> Any:
         """See each decoded request before it is served (None: it never came) and each reply before it is sent."""
@@ -295,6 +287,8 @@ class _Field:
 
     async def _listen(self, server: Any, bus: _Bus, devices: Sequence[Device], place: str) -> None:
         server.context = bus
+        connect = server.callback_new_connection
+        server.callback_new_connection = lambda: _hardened(connect())
         new = [device for device in devices if device not in self._devices]
         self._move(new)
         if not await server.listen():
@@ -306,6 +300,23 @@ class _Field:
         for device in devices:
             if device.moves is not None:
                 device.moves(device, self.loop.time() - self._start_s)
+
+
+def _hardened(handler: Any) -> Any:
+    """Let noise pass a connection of 3.8, which keeps all it cannot decode, and raises on some; 3.16 drops both."""
+    receive = handler.callback_data
+    longest = 516 if isinstance(handler.framer, FramerAscii) else 264  # bytes of a frame, as 3.16 has it
+
+    def callback_data(data: bytes, addr: Any = None) -> int:
+        if len(data) > longest:
+            return len(data)
+        try:
+            return int(receive(data, addr))
+        except (ValueError, IndexError, struct.error):
+            return len(data)
+
+    handler.callback_data = callback_data
+    return handler
 
 
 async def _close_server(server: Any) -> None:
@@ -381,7 +392,7 @@ class Simulator:
         self.stop()
 
     def _running(self) -> _Field:
-        if self._field is None:
+        if self._field is None or self._thread is None or not self._thread.is_alive():
             raise LinkUnavailable("the simulator is not running")
         return self._field
 

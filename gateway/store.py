@@ -25,6 +25,7 @@ LARGEST_FILE_BYTES: Final = 1024 * 1024
 BYTE_ORDER_MARK: Final = "\ufeff"
 
 _TOML_PLACE: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+_LONG_NUMBER: Final = re.compile(r"[0-9][0-9_]{4300}")
 _PLAIN_WORDS: Final = {  # what tomllib says of the commonest slips
     "Cannot overwrite a value": "this key is given twice",
     "Invalid value": "this is no value: a text stands in quotes",
@@ -110,8 +111,10 @@ def _parse(text: str, statements: list[toml_text.Statement], file_name: str) -> 
         raise _unusable(file_name, line, message) from error
     except RecursionError as error:
         raise _unusable(file_name, None, "nested too deep") from error
-    except ValueError as error:  # Python's own limit on digits; a date that does not exist
-        raise _unusable(file_name, None, f"a value is out of all bounds ({str(error).split(':')[0]})") from error
+    except ValueError as error:  # Python's own limit on the digits of a number
+        long = _LONG_NUMBER.search(text)
+        line = text.count("\n", 0, long.start()) + 1 if long else None
+        raise _unusable(file_name, line, "a number of thousands of digits") from error
 
 
 def _in_plain_words(text: str, document: str) -> tuple[int, str]:
@@ -144,8 +147,8 @@ def _subject(path: config_fields.Path, data: Mapping[str, Any]) -> str:
         if len(path) > 3 and isinstance(path[3], int) and path[2] == "request":
             entries.append(_entry_name(path[:4], data))
         return ", ".join(entries)
-    tables = [str(part) for part in path if isinstance(_value(path[: path.index(part) + 1], data), Mapping)]
-    return f"[{'.'.join(config_fields.escaped(table) for table in tables)}]" if tables else ""
+    tables = ".".join(config_fields.escaped(str(part)) for part in path[:-1])
+    return f"[{tables}]" if tables else ""
 
 
 def _entry_name(path: config_fields.Path, data: Mapping[str, Any]) -> str:

@@ -1,0 +1,180 @@
+"""The `rtugate` command (spec section 9).
+
+Exit codes: 0 done, 1 the answer is no, 2 wrong usage. Errors go to stderr, a line each, never a traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from gateway import __version__
+from gateway.clock import SystemClock
+from gateway.config import Config, MasterConfig
+from gateway.errors import ConfigError
+from gateway.line_load import line_load
+from gateway.store import Loaded, load
+from gateway.supervisor import Supervisor
+from gateway.wiring import build
+
+CONFIG_DEFAULT: Final = "/etc/rtugate/rtugate.toml"
+STATE_DEFAULT: Final = "/var/lib/rtugate"
+DEMO_PORT: Final = 5020
+SWITCH_INTERVAL_S: Final = 0.0005  # how long a slave's answer may wait for another thread that computes
+
+log = logging.getLogger("gateway")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    parsed = _parser().parse_args(arguments)
+    try:
+        return int(parsed.command(parsed))
+    except BrokenPipeError:  # the reader of our output has gone: `rtugate check | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("-c", metavar="FILE", dest="config", default=CONFIG_DEFAULT, help="default: %(default)s")
+    common.add_argument(
+        "--state",
+        metavar="DIR",
+        default=os.environ.get("STATE_DIRECTORY", STATE_DEFAULT),
+        help="state directory, not used yet; default: $STATE_DIRECTORY, else " + STATE_DEFAULT,
+    )
+    parser = argparse.ArgumentParser(
+        prog="rtugate", description="Modbus gateway: polls field devices, serves their data to SCADA."
+    )
+    parser.add_argument("--version", action="version", version=f"rtugate {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    run = commands.add_parser("run", parents=[common], help="the gateway, in the foreground; SIGTERM stops it")
+    run.set_defaults(command=_run)
+    check = commands.add_parser("check", parents=[common], help="validate a configuration, show each line's load")
+    check.add_argument("file", metavar="FILE", nargs="?", help="instead of -c FILE")
+    check.set_defaults(command=_check)
+    demo = commands.add_parser("demo", parents=[common], help="simulated devices and the gateway; needs no hardware")
+    demo.add_argument(
+        "--seconds", metavar="N", type=_positive, help="end after N seconds with a verdict (10 is enough)"
+    )
+    demo.add_argument("--port", metavar="PORT", type=_port, default=DEMO_PORT, help="where to serve: %(default)s")
+    demo.add_argument("--silent", choices=["meter", "boiler", "io"], help="a device that does not answer")
+    demo.set_defaults(command=_demo)
+    return parser
+
+
+def _positive(text: str) -> float:
+    seconds = float(text)
+    if not 0 < seconds < 1e9:
+        raise ValueError(text)
+    return seconds
+
+
+def _port(text: str) -> int:
+    port = int(text)
+    if not 1 <= port <= 65535:
+        raise ValueError(text)
+    return port
+
+
+# ------------------------------------------------------------------------------------------------ run
+
+
+def _run(parsed: argparse.Namespace) -> int:
+    path = Path(parsed.config)
+    if not path.exists():
+        return _usage(f"{path}: no such file")
+    logging.basicConfig(format="%(levelname)s %(message)s", stream=sys.stderr)
+    config = _usable(path)
+    log.setLevel(config.log.level.upper())
+    clock = SystemClock()
+    supervisor = Supervisor(build(config, clock).plans, clock)
+    _stop_on_signals(supervisor.stop)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    log.info("rtugate %s runs: %d masters, %d slaves", __version__, len(config.master), len(config.slave))
+    is_clean = supervisor.run()
+    log.info("stopped")
+    return 0 if is_clean else 1
+
+
+def _usable(path: Path) -> Config:
+    """Return the configuration in *path*; where it cannot be used, say why and go on with nothing switched on."""
+    try:
+        loaded = load(path)
+    except ConfigError as error:
+        for finding in error.findings:
+            log.error("%s", finding)
+        log.error("%s cannot be used: running with factory settings, no line is polled or served", path)
+        return Config()
+    for finding in loaded.findings:
+        log.warning("%s", finding)
+    return loaded.config
+
+
+def _stop_on_signals(stop: object) -> None:
+    assert callable(stop)  # noqa: S101 - narrows the type for the handler below
+
+    def handle(number: int, frame: object) -> None:
+        del number, frame
+        stop()
+
+    signal.signal(signal.SIGTERM, handle)
+    signal.signal(signal.SIGINT, handle)
+    signal.signal(signal.SIGHUP, lambda *_: log.warning("reloading is not there yet: restart to use a new file"))
+
+
+# ------------------------------------------------------------------------------------------------ check
+
+
+def _check(parsed: argparse.Namespace) -> int:
+    path = Path(parsed.file or parsed.config)
+    if not path.exists():
+        return _usage(f"{path}: no such file")
+    try:
+        loaded = load(path)
+    except ConfigError as error:
+        for finding in error.findings:
+            print(finding, file=sys.stderr)
+        return 1
+    print(f"{path}: valid")
+    _print_loads(loaded)
+    return 0
+
+
+def _print_loads(loaded: Loaded) -> None:
+    for finding in loaded.findings:
+        print(finding)
+    for master in loaded.config.master:
+        print(_load_text(master))
+
+
+def _load_text(master: MasterConfig) -> str:
+    load_of = line_load(master)
+    line = "its connection" if master.is_tcp else f"{master.baudrate} baud"
+    return f"{master.name}: {load_of.percent:.0f} % of {line}, slowest cycle {load_of.slowest_cycle_s:.1f} s"
+
+
+# ------------------------------------------------------------------------------------------------ demo
+
+
+def _demo(parsed: argparse.Namespace) -> int:
+    from gateway.demo import run_demo  # imports pymodbus and asyncio, which `run` does not pay for
+
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    signal.signal(signal.SIGINT, lambda *_: stop.set())
+    logging.basicConfig(format="%(levelname)s %(message)s", stream=sys.stderr)
+    return run_demo(parsed.seconds, parsed.port, parsed.silent, sys.stdout, stop)
+
+
+def _usage(message: str) -> int:
+    print(f"rtugate: {message}", file=sys.stderr)
+    return 2
