@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +27,7 @@ from gateway.wiring import build
 CONFIG_DEFAULT: Final = "/etc/rtugate/rtugate.toml"
 STATE_DEFAULT: Final = "/var/lib/rtugate"
 DEMO_PORT: Final = 5020
+SIGNALS: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 SWITCH_INTERVAL_S: Final = 0.0005  # how long a slave's answer may wait for another thread that computes
 
 log = logging.getLogger("gateway")
@@ -92,6 +93,7 @@ def _run(parsed: argparse.Namespace) -> int:
     path = Path(parsed.config)
     if not path.exists():
         return _usage(f"{path}: no such file")
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # one that comes early waits until it can be heeded
     logging.basicConfig(format="%(levelname)s %(message)s", stream=sys.stderr)
     config = _usable(path)
     log.setLevel(config.log.level.upper())
@@ -119,16 +121,11 @@ def _usable(path: Path) -> Config:
     return loaded.config
 
 
-def _stop_on_signals(stop: object) -> None:
-    assert callable(stop)  # noqa: S101 - narrows the type for the handler below
-
-    def handle(number: int, frame: object) -> None:
-        del number, frame
-        stop()
-
-    signal.signal(signal.SIGTERM, handle)
-    signal.signal(signal.SIGINT, handle)
+def _stop_on_signals(stop: Callable[[], None]) -> None:
+    signal.signal(signal.SIGTERM, lambda *_: stop())
+    signal.signal(signal.SIGINT, lambda *_: stop())
     signal.signal(signal.SIGHUP, lambda *_: log.warning("reloading is not there yet: restart to use a new file"))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
 
 
 # ------------------------------------------------------------------------------------------------ check

@@ -12,7 +12,7 @@ Threads: ``accept`` and its like run in the thread that writes the register; the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -86,11 +86,13 @@ class CommandQueue(CommandSink):
             self._outlets.append(outlet)
 
     def close(self) -> None:
-        """Forget every command and let go of every point."""
+        """Forget every command and let go of every point; what a command was to deliver becomes bad."""
         self._register.remove_sink(self)
         with self._register.lock:
             self._queue.clear()
             for outlet in self._outlets:
+                if outlet.on_change:
+                    self._judge(outlet, outlet.pending, is_delivered=False)
                 self._release(outlet, list(outlet.pending))
             self._outlets.clear()
 
@@ -115,6 +117,8 @@ class CommandQueue(CommandSink):
             if outlet.span.overlaps(span):
                 start, stop = max(span.start, outlet.span.start), min(span.stop, outlet.span.stop)
                 self._hold(outlet, range(start, stop), number)
+                if outlet.on_change and outlet.whole:  # this command carries what older ones were to carry
+                    self._hold(outlet, list(outlet.pending), number)
                 if outlet.on_change:
                     written = outlet.span if outlet.whole else Span(span.table, start, stop - start)
                     data = self._values(outlet, written)
@@ -127,7 +131,7 @@ class CommandQueue(CommandSink):
         points = self._register.points_locked(span.table)
         return self._register.known_locked(points, span, outlet.commanded_only)
 
-    def _hold(self, outlet: Outlet, points: range, number: int) -> None:
+    def _hold(self, outlet: Outlet, points: Iterable[int], number: int) -> None:
         held = self._register.points_locked(outlet.span.table).held
         for point in points:
             if point not in outlet.pending:
@@ -190,12 +194,11 @@ class CommandQueue(CommandSink):
 
     def answered(self, command: Command) -> None:
         """The device has answered *command*: polls may fill its points again."""
-        self._settle(command.outlet, command.span, command.number)
+        self._settle(command.outlet, command.span, command.number, is_delivered=True)
 
     def drop(self, command: Command) -> None:
         """Give *command* up: its points become bad, and polls may fill them again."""
-        for start, stop in self._settle(command.outlet, command.span, command.number):
-            self._register.mark(Span(command.span.table, start, stop - start), Quality.BAD, command.outlet.source)
+        self._settle(command.outlet, command.span, command.number, is_delivered=False)
 
     def expire(self) -> list[Command]:
         """Drop and return the commands that have waited too long."""
@@ -226,11 +229,20 @@ class CommandQueue(CommandSink):
 
     def delivered(self, outlet: Outlet, number: int) -> None:
         """The device has answered a cyclic request that carried everything up to *number*."""
-        self._settle(outlet, outlet.span, number)
+        self._settle(outlet, outlet.span, number, is_delivered=True)
 
-    def _settle(self, outlet: Outlet, span: Span, number: int) -> list[tuple[int, int]]:
-        """Let go of the points of *span* that no write later than *number* holds; return them as runs."""
+    def _settle(self, outlet: Outlet, span: Span, number: int, is_delivered: bool) -> None:
+        """Let go of the points of *span* that no write later than *number* holds."""
         with self._register.lock:
             points = [p for p in range(span.start, span.stop) if outlet.pending.get(p, number + 1) <= number]
+            self._judge(outlet, points, is_delivered)
             self._release(outlet, points)
-        return runs(points)
+
+    def _judge(self, outlet: Outlet, points: Iterable[int], is_delivered: bool) -> None:
+        """Points not delivered are bad; delivered ones are no longer, if their device was offline meanwhile."""
+        quality = self._register.points_locked(outlet.span.table).quality
+        for point in points:
+            if not is_delivered:
+                quality[point] = Quality.BAD
+            elif quality[point] == Quality.BAD:
+                quality[point] = Quality.GOOD

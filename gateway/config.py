@@ -31,6 +31,7 @@ from gateway.config_fields import (
     PasswordHash,
     Seconds,
     SomeSeconds,
+    Ssid,
     StopBits,
     TableSize,
     Text,
@@ -89,8 +90,8 @@ def _code_in(known: dict[str, int], value: object) -> object:
         return value
     if isinstance(value, str) and value.replace("_", "-") in known:
         return value
-    names = ", ".join(f"{name} ({code})" for name, code in known.items())
-    raise wrong(f"is not one of {names}")
+    codes = ", ".join(str(code) for code in sorted(known.values()))
+    raise wrong(f"is not one of {codes}, nor a name such as {next(iter(known))}")
 
 
 def _polled(value: object) -> object:
@@ -363,7 +364,7 @@ class HmiWiflyConfig(Section):
 
     line: Device = ""
     baudrate: Baudrate = 9600
-    ssid: Annotated[Text, Field(max_length=32)] = ""
+    ssid: Ssid = ""
     passphrase: Text = ""
     address: Interface = "dhcp"
     retries: Annotated[int, Field(ge=0, le=100)] = 5

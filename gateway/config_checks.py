@@ -104,7 +104,8 @@ def _check_the_rest(data: Mapping[str, Any], found: list[Finding]) -> list[Findi
     origins: dict[Path, Path] = {}
     rest = {key: _sound((key,), value, bad, origins) for key, value in data.items() if (key,) not in bad}
     findings = cross_check(Config.model_validate(rest))
-    return [replace(finding, path=_origin(finding.path, origins)) for finding in findings]
+    moved = [replace(finding, path=_origin(finding.path, origins)) for finding in findings]
+    return [finding for finding in moved if finding.path[:1] not in bad]  # not of the defaults in a table's place
 
 
 def _entry(path: Path) -> Path:
@@ -348,8 +349,8 @@ def _reference_number(request: RequestConfig, path: Path) -> Iterator[Finding]:
 def _beyond(config: Config, table: Table, start: int, count: int, path: Path) -> Iterator[Finding]:
     size = config.register_.size(table)
     if start + count > size:
-        points = f"{start}" if count == 1 else f"{start} to {start + count - 1}"
-        yield Finding(path, f"{path[-1]} {points} is beyond {TABLE_NAMES[table]}, which end at {size - 1}")
+        points = "lies" if count == 1 else f"with {count} points goes"
+        yield Finding(path, f"{path[-1]} {start} {points} beyond {TABLE_NAMES[table]}, which end at {size - 1}")
 
 
 def _own_points(config: Config) -> Iterator[Finding]:

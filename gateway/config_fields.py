@@ -125,6 +125,7 @@ def _hash(text: str) -> str:
 
 Name = Annotated[str, AfterValidator(_name)]
 Text = Annotated[str, Field(max_length=64), AfterValidator(_printable)]
+Ssid = Annotated[str, Field(max_length=32), AfterValidator(_printable)]  # IEEE 802.11: 32 octets
 Device = Annotated[str, Field(max_length=255), AfterValidator(_printable), AfterValidator(_device)]
 LineText = Annotated[str, Field(max_length=255), AfterValidator(_printable), AfterValidator(_line)]
 Listen = Annotated[str, Field(max_length=255), AfterValidator(_listen)]

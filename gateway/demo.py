@@ -26,7 +26,8 @@ from gateway.clock import SystemClock
 from gateway.config import Config
 from gateway.errors import LinkUnavailable
 from gateway.link import listen_tcp
-from gateway.modbus.pdu import Table
+from gateway.modbus.pdu import Span, Table
+from gateway.register import DataRegister, Quality
 from gateway.simulator import Device, Simulator, demo_devices
 from gateway.store import load_text
 from gateway.supervisor import Supervisor
@@ -129,6 +130,11 @@ class Watched:
         self.had.append(self.now())
         self.device.moves = moves
 
+    @property
+    def span(self) -> Span:
+        """Where the gateway keeps them."""
+        return Span(self.table, self.point, self.count)
+
     def now(self) -> tuple[int, ...]:
         """Return the device's own values."""
         return tuple(self.device.get(self.table, self.address, self.count))
@@ -156,7 +162,7 @@ class Scada:
     """A pymodbus client on the gateway's slave."""
 
     def __init__(self, port: int) -> None:
-        self._client = ModbusTcpClient("127.0.0.1", port=port, timeout=2, retries=1)
+        self._client: Any = ModbusTcpClient("127.0.0.1", port=port, timeout=2, retries=1)
         known = inspect.signature(self._client.read_coils).parameters
         self._unit = {"device_id" if "device_id" in known else "slave": 1}  # the name changed in pymodbus 3.10
 
@@ -201,6 +207,14 @@ class Demo:
             watched.follow()
             watched.device.silent = watched.device.name == silent
         self.setpoint: int | None = None
+        self.register: DataRegister | None = None
+
+    def quality(self, watched: Watched) -> str:
+        """Return what the gateway itself thinks of the values, unless they are good."""
+        if self.register is None:
+            return ""
+        worst = {sample.quality for sample in self.register.samples(watched.span)} - {Quality.GOOD}
+        return "".join(f"  ({quality.name.lower()})" for quality in sorted(worst))
 
     @contextmanager
     def running(self) -> Iterator[Scada]:
@@ -211,13 +225,17 @@ class Demo:
             serial = simulator.add_serial([meter, boiler])
             config = self.configuration(serial, simulator.add_tcp([block]))
             clock = SystemClock()
-            supervisor = Supervisor(build(config, clock).plans, clock)
+            station = build(config, clock)
+            self.register = station.register
+            supervisor = Supervisor(station.plans, clock)
             started = threading.Event()
             thread = threading.Thread(target=supervisor.run, args=(started.set,), name="supervisor")
             scada = Scada(self.port)
             thread.start()
             try:
                 started.wait()
+                for task in supervisor.tasks.values():
+                    task.ready.wait()
                 yield scada
             finally:
                 scada.close()
@@ -293,11 +311,12 @@ and serves them as a slave (server) on 127.0.0.1:{port}, unit 1. Look at it your
 
 def _show(demo: Demo, passed_s: float, number: int, out: TextIO) -> None:
     meter, boiler, block = (watched.seen or (0,) * watched.count for watched in demo.watched)
-    rows = [
-        ("meter", f"{meter[0] / 10:.1f} V  {meter[1] / 100:.2f} A  {meter[2]} W  {meter[3] << 16 | meter[4]} Wh"),
-        ("boiler", f"{boiler[0] / 10:.1f} C  flow {boiler[1] / 10:.1f} C  return {boiler[2] / 10:.1f} C"),
-        ("io", f"ramp {block[0]}  sine {block[1]}  coils on {block[3]}"),
+    texts = [
+        f"{meter[0] / 10:.1f} V  {meter[1] / 100:.2f} A  {meter[2]} W  {meter[3] << 16 | meter[4]} Wh",
+        f"{boiler[0] / 10:.1f} C  flow {boiler[1] / 10:.1f} C  return {boiler[2] / 10:.1f} C",
+        f"ramp {block[0]}  sine {block[1]}  coils on {block[3]}",
     ]
+    rows = [(w.device.name, text + demo.quality(w)) for w, text in zip(demo.watched, texts, strict=True)]
     if not out.isatty():
         if number % 2 == 0:
             print(f"{passed_s:5.0f} s  " + " | ".join(f"{name}: {text}" for name, text in rows), file=out, flush=True)

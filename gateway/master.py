@@ -65,6 +65,7 @@ class Master:
         self.name = config.name
         self.config = config
         self.enabled = config.enabled
+        self.ready = threading.Event()
         self.counters = PollCounters()
         self.busy_s = 0.0  # of the line's time, silences and listening included
         self.polls, self.devices = polls_of(config)
@@ -155,6 +156,7 @@ class Master:
         self._expire()
         self._show_status()
         if not self.enabled:
+            self.ready.set()
             self._let_go()
             self._waker.wait(self._wait_s())
         elif self._line is None:
@@ -197,6 +199,9 @@ class Master:
         except LinkError as error:
             self._lost(str(error))
             return
+        finally:
+            self.ready.set()
+        log.debug("%s: polling on %s", self.name, self.config.line)
         self._line = Line(self._link, self.config.framing_used, self._timing(self._link), self._clock)
         self._silent_in_row = 0
         self._has_answered = False

@@ -362,7 +362,7 @@ def _is_fresh(points: _Points, claim: Claim, span: Span, now_s: float) -> bool:
     quality = points.quality[start:stop]
     if Quality.BAD in quality or Quality.NEVER in quality:
         return False
-    return min(points.time_s[start:stop]) >= now_s - claim.stale_after_s
+    return now_s - min(points.time_s[start:stop]) <= claim.stale_after_s  # as in _sample, to the last bit
 
 
 def _stale_limits(points: _Points, span: Span) -> dict[int, float]:

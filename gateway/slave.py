@@ -66,6 +66,7 @@ class SerialSlave:
         self.name = config.name
         self.config = config
         self.enabled = config.enabled
+        self.ready = threading.Event()
         self.server = server_of(config, register)
         self._clock = clock
         self._waker = waker
@@ -109,6 +110,7 @@ class SerialSlave:
     def step(self) -> None:
         """Wait for bytes or for the end of a silence, and do what follows."""
         if not self.enabled:
+            self.ready.set()
             self._let_go()
             self._waker.wait(self._wait_limit_s)
         elif self._link is None:
@@ -130,9 +132,12 @@ class SerialSlave:
         except LinkError as error:
             self._opening.failed(str(error))
             return
+        finally:
+            self.ready.set()
         self._opening.worked()
         self._silence_s = silence_s(self.config.baudrate, self._link.character_s)
         self._framer.reset()
+        log.info("%s: listening on %s", self.name, self.config.line)
 
     def _let_go(self) -> None:
         if self._link is not None:
@@ -217,6 +222,7 @@ class TcpSlave:
         self.name = config.name
         self.config = config
         self.enabled = config.enabled
+        self.ready = threading.Event()
         self.server = server_of(config, register)
         self.clients: dict[int, Client] = {}
         self.refused_clients = 0
@@ -271,6 +277,7 @@ class TcpSlave:
     def step(self) -> None:
         """Wait for something to happen, and do what follows."""
         if not self.enabled:
+            self.ready.set()
             self._let_go()
         elif self._listener is None and not self._opening.wait_s():
             self._open()
@@ -289,8 +296,11 @@ class TcpSlave:
         except LinkError as error:
             self._opening.failed(str(error))
             return
+        finally:
+            self.ready.set()
         self._opening.worked()
         self._selector.register(self._listener, selectors.EVENT_READ)
+        log.info("%s: listening on %s", self.name, self.config.line)
 
     def _let_go(self) -> None:
         for client in list(self.clients.values()):

@@ -30,6 +30,7 @@ _PLAIN_WORDS: Final = {  # what tomllib says of the commonest slips
     "Cannot overwrite a value": "this key is given twice",
     "Invalid value": "this is no value: a text stands in quotes",
     "Expected '=' after a key in a key/value pair": "a key is followed by = and a value",
+    "Expected newline or end of document after a statement": "the line goes on behind its value",
     "Illegal character '\\n'": "the quotes of this text are not closed",
 }
 
@@ -113,8 +114,8 @@ def _parse(text: str, statements: list[toml_text.Statement], file_name: str) -> 
         raise _unusable(file_name, None, "nested too deep") from error
     except ValueError as error:  # Python's own limit on the digits of a number
         long = _LONG_NUMBER.search(text)
-        line = text.count("\n", 0, long.start()) + 1 if long else None
-        raise _unusable(file_name, line, "a number of thousands of digits") from error
+        at = text.count("\n", 0, long.start()) + 1 if long else None
+        raise _unusable(file_name, at, "a number of thousands of digits") from error
 
 
 def _in_plain_words(text: str, document: str) -> tuple[int, str]:

@@ -28,6 +28,7 @@ class Task(Protocol):
     """A master, a slave, a console: something with a thread of its own."""
 
     name: str
+    ready: threading.Event  # set once its line is open, or it has said why not
 
     def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
         """Work until *stop*; call *alive* whenever something has been got on with."""
@@ -68,7 +69,7 @@ class Supervisor:
     def run(self, started: Callable[[], None] = lambda: None) -> bool:
         """Run all tasks until ``stop``. Returns False if one of them did not end in time.
 
-        started: called once all threads run.
+        started: called once all tasks are made and their threads run.
         """
         try:
             for runner in self._runners:
@@ -110,7 +111,12 @@ class _Runner:
 
     def start(self) -> None:
         self._restart_s = None
-        self._thread = threading.Thread(target=self._work, name=self.plan.name)
+        try:
+            self.task = self.plan.make(self._waker)
+        except Exception:  # noqa: BLE001 - a bug in one task is no reason to take the others down
+            self._failed()
+            return
+        self._thread = threading.Thread(target=self._work, args=(self.task,), name=self.plan.name)
         self._thread.start()
 
     def look_after(self) -> float:
@@ -137,16 +143,16 @@ class _Runner:
     def _alive(self) -> None:
         self._alive_s = self._clock.monotonic()
 
-    def _work(self) -> None:
+    def _work(self, task: Task) -> None:
         sharpen_timers()
         try:
-            self.task = self.plan.make(self._waker)
-            self.task.run(self._stop, self._alive)
-            self._restart_after_s = RESTART_FIRST_S
-        except Exception:  # a bug ends its task only; here it is told, and the task made anew
-            log.exception("%s: ended with an error; starting it again in %.0f s", self.plan.name, self._restart_after_s)
-            self._restart_s = self._clock.monotonic() + self._restart_after_s
-            self._restart_after_s = min(RESTART_MOST_S, 2 * self._restart_after_s)
-            self._told()
-        finally:
+            task.run(self._stop, self._alive)
+        except Exception:  # noqa: BLE001 - a bug ends its own task only: it is told, and the task made anew
             self.task = None
+            self._failed()
+
+    def _failed(self) -> None:
+        log.exception("%s: ended with an error; starting it again in %.0f s", self.plan.name, self._restart_after_s)
+        self._restart_s = self._clock.monotonic() + self._restart_after_s
+        self._restart_after_s = min(RESTART_MOST_S, 2 * self._restart_after_s)
+        self._told()

@@ -1,9 +1,11 @@
-"""Fakes that tests hand in: a clock that jumps, and a link on which a scripted device answers."""
+"""Fakes that tests hand in: a clock that jumps, a link on which a scripted device answers, devices with registers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+
+from gateway.link import Waker
 
 
 class JumpingClock:
@@ -64,3 +66,145 @@ class ScriptedLink:
 
     def close(self) -> None:
         self.closed = True
+
+
+class JumpingWaker(Waker):
+    """A waker whose waits pass at once on the fake clock; it has no descriptor."""
+
+    def __init__(self, clock: JumpingClock) -> None:
+        self._clock = clock
+        self.is_woken = False
+        self.waits_s: list[float] = []
+
+    def wake(self) -> None:
+        self.is_woken = True
+
+    def fileno(self) -> int:
+        return -1
+
+    def clear(self) -> None:
+        self.is_woken = False
+
+    def wait(self, timeout_s: float | None) -> bool:
+        assert timeout_s is not None
+        self.waits_s.append(timeout_s)
+        woken, self.is_woken = self.is_woken, False
+        if not woken:
+            self._clock.pass_s(timeout_s)
+        return woken
+
+    def close(self) -> None:
+        self.is_woken = False
+
+
+def crc_rtu(data: bytes) -> bytes:
+    """The CRC of *data* as on the wire, bit by bit: independent of the table in ``framing``."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return bytes([crc & 0xFF, crc >> 8])
+
+
+def rtu(unit: int, pdu: bytes) -> bytes:
+    """An RTU frame."""
+    return bytes([unit]) + pdu + crc_rtu(bytes([unit]) + pdu)
+
+
+def ascii_frame(unit: int, pdu: bytes) -> bytes:
+    """An ASCII frame."""
+    body = bytes([unit]) + pdu
+    return f":{body.hex().upper()}{-sum(body) & 0xFF:02X}\r\n".encode()
+
+
+def tcp(transaction: int, unit: int, pdu: bytes) -> bytes:
+    """A Modbus TCP frame."""
+    return transaction.to_bytes(2, "big") + bytes(2) + (1 + len(pdu)).to_bytes(2, "big") + bytes([unit]) + pdu
+
+
+def words(*values: int) -> bytes:
+    """Registers as on the wire."""
+    return b"".join(value.to_bytes(2, "big") for value in values)
+
+
+@dataclass
+class FieldWrite:
+    """One write as a device got it; values are words, or 0 and 1."""
+
+    when_s: float
+    unit: int
+    address: int
+    values: list[int]
+
+
+@dataclass
+class FakeField:
+    """All devices of one line, with registers and coils that keep what is written; the device of a ScriptedLink.
+
+    Every unit exists and answers after *answer_after_s*, unless it is in *silent*, *damaging* (wrong CRC) or
+    *refusing* (unit, function: exception code). *during* is called while a request is on its way, before it is
+    carried out.
+    """
+
+    clock: JumpingClock
+    framing: str = "rtu"
+    answer_after_s: float = 0.01
+    registers: dict[tuple[int, int], int] = field(default_factory=dict)  # unit, address: value
+    coils: dict[tuple[int, int], int] = field(default_factory=dict)
+    silent: set[int] = field(default_factory=set)
+    damaging: set[int] = field(default_factory=set)
+    refusing: dict[tuple[int, int], int] = field(default_factory=dict)
+    during: Callable[[int, bytes], None] = lambda unit, pdu: None
+    asked: list[tuple[float, int, bytes]] = field(default_factory=list)  # when, unit, PDU
+    writes: list[FieldWrite] = field(default_factory=list)
+
+    def __call__(self, frame: bytes) -> list[tuple[float, bytes]]:
+        transaction = 0
+        if self.framing == "tcp":
+            transaction, unit, pdu = int.from_bytes(frame[:2], "big"), frame[6], frame[7:]
+        else:
+            assert crc_rtu(frame[:-2]) == frame[-2:]
+            unit, pdu = frame[0], frame[1:-2]
+        self.asked.append((self.clock.monotonic(), unit, pdu))
+        self.during(unit, pdu)
+        if unit in self.silent:
+            return []
+        reply = self.answer(unit, pdu)
+        if unit == 0 and self.framing != "tcp":
+            return []
+        answer = tcp(transaction, unit, reply) if self.framing == "tcp" else rtu(unit, reply)
+        if unit in self.damaging:
+            answer = answer[:-1] + bytes([answer[-1] ^ 0xFF])
+        return [(self.answer_after_s, answer)]
+
+    def answer(self, unit: int, pdu: bytes) -> bytes:
+        """Carry out *pdu*; return the PDU that answers it."""
+        function, address, number = pdu[0], int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big")
+        if (unit, function) in self.refusing:
+            return bytes([function | 0x80, self.refusing[unit, function]])
+        if function in (1, 2):
+            bits = sum(self.coils.get((unit, address + i), 0) << i for i in range(number))
+            data = bits.to_bytes((number + 7) // 8, "little")
+            return bytes([function, len(data)]) + data
+        if function in (3, 4):
+            data = words(*(self.registers.get((unit, address + i), 0) for i in range(number)))
+            return bytes([function, len(data)]) + data
+        if function == 5:
+            self._keep(self.coils, unit, address, [number >> 15])
+        elif function == 6:
+            self._keep(self.registers, unit, address, [number])
+        elif function == 15:
+            self._keep(self.coils, unit, address, [pdu[6 + i // 8] >> i % 8 & 1 for i in range(number)])
+        else:
+            values = [int.from_bytes(pdu[6 + 2 * i : 8 + 2 * i], "big") for i in range(number)]
+            self._keep(self.registers, unit, address, values)
+        return pdu[:5]
+
+    def _keep(self, where: dict[tuple[int, int], int], unit: int, address: int, values: list[int]) -> None:
+        self.writes.append(FieldWrite(self.clock.monotonic(), unit, address, values))
+        where.update({(unit, address + i): value for i, value in enumerate(values)})
+
+    def count(self, unit: int) -> int:
+        """How many requests *unit* was sent."""
+        return sum(asked == unit for _, asked, _ in self.asked)

@@ -357,6 +357,8 @@ def decode_reply(request: Request, pdu: bytes) -> bytes:
     source:  sections 6.1 to 6.17 and 7.
     """
     if len(pdu) == 2 and pdu[0] == request.function | EXCEPTION_BIT:
+        if pdu[1] == 0:  # no exception has this code, and to the callers 0 means no error
+            raise ReplyMismatch("an exception reply without an exception code")
         raise DeviceRefused(pdu[1])
     if not pdu or pdu[0] != request.function:
         raise ReplyMismatch(f"a reply to function {pdu[0] if pdu else None}")

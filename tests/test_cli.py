@@ -1,0 +1,245 @@
+"""The `rtugate` command as a person types it: real processes, exit codes, what goes where."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from gateway import __version__
+from gateway.cli import main
+from gateway.modbus.pdu import Table
+from gateway.simulator import Device, Simulator
+from tests.peers import client_tcp, free_port, unit_kwargs
+
+GOOD = """\
+[[master]]
+name = "field"
+line = "/dev/ttyS2"
+
+[[master.request]]
+name = "boiler"
+unit = 17
+function = 3
+address = 107
+count = 100
+every = 1
+point = 0
+
+[[slave]]
+name = "scada"
+line = "tcp://127.0.0.1:{port}"
+unit = 1
+"""
+
+
+def rtugate(*arguments: str, timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "gateway", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run `rtugate` until the block ends; what it said is in ``process.said``."""
+    command = [sys.executable, "-m", "gateway", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def wait_for_line(process: subprocess.Popen[str], words: str) -> str:
+    assert process.stdout is not None
+    said = ""
+    for line in process.stdout:
+        said += line
+        if words in line:
+            return said
+    pytest.fail(f"it ended without saying {words!r}: {said}")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "rtugate.toml"
+    path.write_text(GOOD.format(port=free_port()))
+    return path
+
+
+# ------------------------------------------------------------------------------------------------ check
+
+
+def test_check_prints_the_load_of_each_line(file: Path) -> None:
+    checked = rtugate("check", str(file))
+    assert checked.returncode == 0
+    assert checked.stderr == ""
+    assert checked.stdout == f"{file}: valid\nfield: 13 % of 19200 baud, slowest cycle 1.0 s\n"
+
+
+def test_check_takes_the_file_of_c_as_well(file: Path) -> None:
+    assert rtugate("check", "-c", str(file)).stdout == rtugate("check", str(file)).stdout
+
+
+def test_check_names_every_error_with_file_line_and_key(file: Path) -> None:
+    file.write_text(GOOD.format(port=99999).replace("count = 100", "count = 126").replace("unit = 17", "unit = 248"))
+    checked = rtugate("check", str(file))
+    assert checked.returncode == 1
+    assert checked.stdout == ""
+    lines = checked.stderr.splitlines()
+    assert 'rtugate.toml:10: master "field", request "boiler": count 126 is more than 125' in lines
+    assert any(line.startswith("rtugate.toml:7: ") and "unit 248" in line and "247" in line for line in lines)
+    assert any(line.startswith("rtugate.toml:16: ") and "99999" in line for line in lines)
+    assert len(lines) == 3
+
+
+def test_check_of_a_missing_file_is_wrong_usage(tmp_path: Path) -> None:
+    checked = rtugate("check", str(tmp_path / "no.toml"))
+    assert checked.returncode == 2
+    assert checked.stderr == f"rtugate: {tmp_path / 'no.toml'}: no such file\n"
+
+
+def test_check_warns_of_a_line_that_cannot_keep_up(file: Path) -> None:
+    file.write_text(file.read_text().replace("every = 1\n", "every = 0.05\n"))
+    checked = rtugate("check", str(file))
+    assert checked.returncode == 0
+    assert "warning" in checked.stdout
+    assert "% of the line" in checked.stdout
+
+
+def test_output_into_a_closed_pipe_is_no_traceback(file: Path) -> None:
+    command = f"{sys.executable} -m gateway check {file} | true"
+    ended = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=30, check=False)  # noqa: S602 - a shell's pipe is what is tested
+    assert "Traceback" not in ended.stderr
+
+
+# ------------------------------------------------------------------------------------------------ usage
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("nonsense",),
+        ("demo", "--seconds", "0"),
+        ("demo", "--seconds", "x"),
+        ("demo", "--port", "70000"),
+        ("demo", "--silent", "nobody"),
+        ("run", "extra"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(arguments: tuple[str, ...]) -> None:
+    ended = rtugate(*arguments)
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert "Traceback" not in ended.stderr
+
+
+def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"rtugate {__version__}\n"
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    assert "demo" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------------------------------------ run
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_run_polls_serves_and_stops_cleanly_on_a_signal(tmp_path: Path, number: signal.Signals) -> None:
+    device, port = Device("device", 17), free_port()
+    device.set(Table.HOLDING_REGISTERS, 107, [555, 0, 100])
+    file = tmp_path / "rtugate.toml"
+    with Simulator() as simulator:
+        text = GOOD.format(port=port).replace("count = 100", "count = 3").replace("every = 1\n", "every = 0.05\n")
+        line = f'"{simulator.add_serial([device])}"\nparity = "none"'
+        file.write_text(text.replace('"/dev/ttyS2"', line))
+        with running("run", "-c", str(file)) as process:
+            wait_for_line(process, "scada: listening on")
+            with client_tcp(port) as scada:
+                while (reply := scada.read_holding_registers(0, count=3, **unit_kwargs(1))).isError() or not any(
+                    reply.registers
+                ):
+                    assert process.poll() is None
+            process.send_signal(number)
+            assert process.wait(timeout=2.0) == 0
+    assert reply.registers == [555, 0, 100]
+
+
+def test_run_of_a_missing_file_is_exit_code_2(tmp_path: Path) -> None:
+    ended = rtugate("run", "-c", str(tmp_path / "no.toml"))
+    assert ended.returncode == 2
+    assert ended.stderr == f"rtugate: {tmp_path / 'no.toml'}: no such file\n"
+
+
+def test_run_never_refuses_to_start_because_of_a_bad_file(file: Path) -> None:
+    file.write_text("[[master]]\nname = \n")
+    with running("run", "-c", str(file)) as process:
+        said = wait_for_line(process, "factory settings")
+        assert "rtugate.toml:2:" in said
+        process.terminate()
+        assert process.wait(timeout=2.0) == 0
+
+
+def test_run_reports_a_missing_port_once_and_goes_on(file: Path) -> None:
+    file.write_text(file.read_text().replace("/dev/ttyS2", "/dev/rtugate-is-not-there"))
+    with running("run", "-c", str(file)) as process:
+        said = wait_for_line(process, "/dev/rtugate-is-not-there")
+        assert "ERROR field: /dev/rtugate-is-not-there" in said
+        process.terminate()
+        assert process.wait(timeout=2.0) == 0
+
+
+def test_a_hang_up_is_logged_and_changes_nothing(file: Path) -> None:
+    with running("run", "-c", str(file)) as process:
+        wait_for_line(process, "runs:")
+        process.send_signal(signal.SIGHUP)
+        wait_for_line(process, "reloading is not there yet")
+        process.terminate()
+        assert process.wait(timeout=2.0) == 0
+
+
+# ------------------------------------------------------------------------------------------------ demo
+
+
+def test_the_demo_passes_when_all_devices_answer() -> None:
+    ended = rtugate("demo", "--seconds", "5", "--port", str(free_port()))
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "demo: passed" in ended.stdout
+    assert "arrived in the boiler" in ended.stdout
+    assert "mbpoll -m tcp" in ended.stdout
+
+
+@pytest.mark.parametrize("silent", ["meter", "boiler", "io"])
+def test_the_demo_fails_when_a_device_is_silent(silent: str) -> None:
+    ended = rtugate("demo", "--seconds", "5", "--port", str(free_port()), "--silent", silent)
+    assert ended.returncode == 1
+    assert "demo: FAILED" in ended.stdout
+    lines = [line for line in ended.stdout.splitlines() if line.startswith(f"{silent} ")]
+    assert "changed 0 times" in lines[-1]
+
+
+def test_the_demo_says_when_its_port_is_taken() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        ended = rtugate("demo", "--seconds", "5", "--port", str(taken.getsockname()[1]))
+    assert ended.returncode == 1
+    assert "already in use" in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+
+
+def test_the_demo_without_an_end_stops_on_a_signal() -> None:
+    with running("demo", "--port", str(free_port())) as process:
+        wait_for_line(process, "s  meter:")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=4.0) == 0
