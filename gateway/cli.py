@@ -117,7 +117,7 @@ def _usable(path: Path) -> Config:
         log.error("%s cannot be used: running with factory settings, no line is polled or served", path)
         return Config()
     for finding in loaded.findings:
-        log.warning("%s", finding)
+        log.log(logging.INFO if finding.severity == "note" else logging.WARNING, "%s", finding)
     return loaded.config
 
 

@@ -29,6 +29,7 @@ from gateway.config_fields import (
     OptionalPoint,
     Parity,
     PasswordHash,
+    SecondOrMore,
     Seconds,
     SomeSeconds,
     Ssid,
@@ -36,7 +37,6 @@ from gateway.config_fields import (
     TableSize,
     Text,
     Unit,
-    WholeSeconds,
     host_port,
     wrong,
 )
@@ -165,7 +165,7 @@ class RequestConfig(Section):
 
     name: Name | None = None
     enabled: bool = True
-    unit: Annotated[Unit, Field(description="1 to 247")]
+    unit: Annotated[Unit, Field(description="1 to 247", json_schema_extra={"maximum": 255})]
     function: Annotated[
         int | str,
         BeforeValidator(_polled),
@@ -376,8 +376,8 @@ class HmiConfig(Section):
     language: Literal["en", "es", "pt"] = "en"
     ascii: bool = False
     serial_hold: Seconds = 30.0
-    idle_timeout: WholeSeconds = 300.0
-    login_timeout: WholeSeconds = 60.0
+    idle_timeout: SecondOrMore = 300.0
+    login_timeout: SecondOrMore = 60.0
     password: PasswordHash = ""
     confirm_minutes: Annotated[int, Field(ge=1, le=1440)] = 10
     serial: HmiSerialConfig = HmiSerialConfig()
@@ -388,7 +388,7 @@ class HmiConfig(Section):
 class WatchdogConfig(Section):
     """[watchdog]: how long a task may stand still, and the device that then resets the machine."""
 
-    timeout: WholeSeconds = 10.0
+    timeout: SecondOrMore = 10.0
     device: Device = ""
     device_timeout: Annotated[int, Field(ge=1, le=86400)] = 30
 

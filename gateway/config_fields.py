@@ -16,7 +16,8 @@ from difflib import get_close_matches
 from ipaddress import ip_address, ip_interface, ip_network
 from typing import Annotated, Any, Final, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
+from annotated_types import Ge, Gt, Le, MaxLen
+from pydantic import AfterValidator, AllowInfNan, BaseModel, BeforeValidator, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 Path = tuple[str | int, ...]
@@ -123,26 +124,27 @@ def _hash(text: str) -> str:
     return text
 
 
+# No Field() in here: pydantic 2.10 gives the default of one field of a shared type to the others.
 Name = Annotated[str, AfterValidator(_name)]
-Text = Annotated[str, Field(max_length=64), AfterValidator(_printable)]
-Ssid = Annotated[str, Field(max_length=32), AfterValidator(_printable)]  # IEEE 802.11: 32 octets
-Device = Annotated[str, Field(max_length=255), AfterValidator(_printable), AfterValidator(_device)]
-LineText = Annotated[str, Field(max_length=255), AfterValidator(_printable), AfterValidator(_line)]
-Listen = Annotated[str, Field(max_length=255), AfterValidator(_listen)]
+Text = Annotated[str, MaxLen(64), AfterValidator(_printable)]
+Ssid = Annotated[str, MaxLen(32), AfterValidator(_printable)]  # IEEE 802.11: 32 octets
+Device = Annotated[str, MaxLen(255), AfterValidator(_printable), AfterValidator(_device)]
+LineText = Annotated[str, MaxLen(255), AfterValidator(_printable), AfterValidator(_line)]
+Listen = Annotated[str, MaxLen(255), AfterValidator(_listen)]
 Network = Annotated[str, AfterValidator(_network)]
 Interface = Annotated[str, AfterValidator(_interface)]
-PasswordHash = Annotated[str, Field(max_length=255), AfterValidator(_hash)]
+PasswordHash = Annotated[str, MaxLen(255), AfterValidator(_hash)]
 
-Seconds = Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False)]
-SomeSeconds = Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)]
-WholeSeconds = Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)]  # fractions allowed
-Cycle = Annotated[float, Field(ge=0.01, le=86400, allow_inf_nan=False)]
-Factor = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
+Seconds = Annotated[float, Ge(0), Le(86400), AllowInfNan(False)]
+SomeSeconds = Annotated[float, Gt(0), Le(86400), AllowInfNan(False)]
+SecondOrMore = Annotated[float, Ge(1), Le(86400), AllowInfNan(False)]
+Cycle = Annotated[float, Ge(0.01), Le(86400), AllowInfNan(False)]
+Factor = Annotated[float, Ge(-1e12), Le(1e12), AllowInfNan(False)]
 
-Unit = Annotated[int, Field(ge=0, json_schema_extra={"maximum": 255}), AfterValidator(_unit)]
-Address = Annotated[int, Field(ge=0, le=65535)]  # of a device or of the register: a point
-OptionalPoint = Annotated[int, Field(ge=-1, le=65535)]
-TableSize = Annotated[int, Field(ge=1, le=65536)]
+Unit = Annotated[int, Ge(0), AfterValidator(_unit)]
+Address = Annotated[int, Ge(0), Le(65535)]  # of a device or of the register: a point
+OptionalPoint = Annotated[int, Ge(-1), Le(65535)]
+TableSize = Annotated[int, Ge(1), Le(65536)]
 
 Baudrate = Annotated[
     Literal[1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400],

@@ -159,6 +159,7 @@ class SerialSlave:
             self._answer_burst(link)
         if self._framer.pending and now_s >= self._heard_s + self.config.character_timeout_used:
             self._framer.reset()
+        self.counters.damaged = self._framer.damaged
 
     def _due_s(self, now_s: float) -> float:
         if self._is_talk:
@@ -181,7 +182,6 @@ class SerialSlave:
                 self.counters.unanswered += 1
             else:
                 link.write(self._framer.encode(Frame(frame.unit, answer(frame.pdu, self.server))))
-        self.counters.damaged = self._framer.damaged
 
 
 def frames_in(framer: Framer) -> list[Frame]:
@@ -337,6 +337,7 @@ class TcpSlave:
                 self._close(client, f"nothing asked for {idle_s:.0f} s")
             elif self._forgets_parts and client.framer.pending and idle_s >= self.config.character_timeout_used:
                 client.framer.reset()
+                self._count_damage(client)
 
     # -------------------------------------------------------------------------------------------- clients
 
@@ -418,7 +419,7 @@ class TcpSlave:
             reply = self._reply(client, frame)
             if reply is not None:
                 client.unsent += client.framer.encode(Frame(frame.unit, reply, frame.transaction))
-        client.server.counters.damaged = client.framer.damaged
+        self._count_damage(client)
         return True
 
     def _reply(self, client: Client, frame: Frame) -> bytes | None:
@@ -426,16 +427,25 @@ class TcpSlave:
         if self.config.framing_used == "tcp":
             if frame.unit in OWN_UNITS or frame.unit == self.config.unit:
                 return self._answer(client, frame)
-            client.server.counters.foreign += 1
+            self._count_foreign(client)
             return exception_reply(frame.pdu[0], ExceptionCode.GATEWAY_TARGET_FAILED)
         if frame.unit == BROADCAST:
             client.server.counters.broadcasts += 1
+            self.counters.broadcasts += 1
             self._answer(client, frame)
         elif frame.unit == self.config.unit:
             return self._answer(client, frame)
         else:
-            client.server.counters.foreign += 1
+            self._count_foreign(client)
         return None
+
+    def _count_foreign(self, client: Client) -> None:
+        client.server.counters.foreign += 1
+        self.counters.foreign += 1
+
+    def _count_damage(self, client: Client) -> None:
+        self.counters.damaged += client.framer.damaged - client.server.counters.damaged
+        client.server.counters.damaged = client.framer.damaged
 
     def _answer(self, client: Client, frame: Frame) -> bytes:
         reply = answer(frame.pdu, client.server)

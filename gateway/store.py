@@ -154,18 +154,10 @@ def _subject(path: config_fields.Path, data: Mapping[str, Any]) -> str:
 
 def _entry_name(path: config_fields.Path, data: Mapping[str, Any]) -> str:
     """`request "boiler"`, or `request 3` where there is no sound name."""
-    entry = _value(path, data)
+    entry: Any = data
+    for part in path:
+        entry = entry[part]
     name = entry.get("name") if isinstance(entry, Mapping) else None
     kind, index = path[-2:]
     is_sound = isinstance(name, str) and config_fields.is_name(name)
     return f'{kind} "{name}"' if is_sound else f"{kind} {int(index) + 1}"
-
-
-def _value(path: config_fields.Path, data: Any) -> Any:
-    """What stands at *path* in the parsed file, or None."""
-    for part in path:
-        try:
-            data = data[part]
-        except (KeyError, IndexError, TypeError):
-            return None
-    return data

@@ -253,7 +253,8 @@ class Line:
     # -------------------------------------------------------------------------------------------- inside
 
     def _step(self, wait_s: float) -> None:
-        self._time_passes()
+        if self.state is not State.AWAITING:  # a reply that came in time may lie unread: first look, then judge
+            self._time_passes()
         if self._done is not None:
             return
         due_s = self._next_s()
@@ -387,6 +388,9 @@ class Line:
         if now_s < self._silent_s():
             if now_s >= self._held_back_s + asked.timeout_s + self._timing.delay_s:
                 self._fail(Event.DAMAGE, DAMAGED, "the line is never silent")
+            return
+        if not self._has_transactions and (unread := self._link.read(0.0)):  # a late reply that nobody looked for
+            self._heard(unread)
             return
         self._transaction = (self._transaction + 1) & 0xFFFF
         self._framer.expect(asked.unit, asked.request.function)

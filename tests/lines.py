@@ -135,9 +135,10 @@ class Running:
             self._turned.wait_for(lambda: self._ended or condition(), timeout_s)
             assert condition(), "the task has ended" if self._ended else f"nothing of the kind in {timeout_s:g} s"
 
-    def wait_turns(self, count: int) -> None:
-        """Return once the task has come round *count* more times."""
-        goal = self.turns + count
+    def come_round(self) -> None:
+        """Wake the task; return once it has come round: what it was doing is done, and it looks at all things anew."""
+        goal = self.turns + 1
+        self._task.wake()
         self.wait_until(lambda: self.turns >= goal)
 
     def stop(self) -> None:
@@ -184,6 +185,7 @@ class RawClient:
         """*source*: the address to come from, one of 127.0.0.0/8."""
         origin = (source, 0) if source else None
         self.socket = socket.create_connection((host, port), timeout=PATIENCE_S, source_address=origin)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes) -> None:
         self.socket.sendall(data)

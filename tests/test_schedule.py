@@ -77,9 +77,7 @@ def test_only_the_requests_of_the_mask_are_picked_and_the_others_stay_due() -> N
     assert turns(schedule, 100.0) == [0, 2]
 
 
-@pytest.mark.parametrize(
-    ("late_s", "missed"), [(0.0, 0), (0.75, 0), (1.0, 1), (1.5, 1), (3.0, 3), (7.25, 7)], ids=lambda value: str(value)
-)
+@pytest.mark.parametrize(("late_s", "missed"), [(0.0, 0), (0.75, 0), (1.0, 1), (1.5, 1), (3.0, 3), (7.25, 7)], ids=str)
 def test_cycles_missed_are_counted_not_queued(late_s: float, missed: int) -> None:
     schedule = Schedule([1.0])
     assert schedule.sent(0, 100.0) == 0
@@ -89,18 +87,17 @@ def test_cycles_missed_are_counted_not_queued(late_s: float, missed: int) -> Non
 
 def test_a_request_sent_late_keeps_its_grid() -> None:
     schedule = Schedule([1.0])
-    schedule.sent(0, 100.0)
-    schedule.sent(0, 101.5)
+    turn(schedule, 100.0)
+    turn(schedule, 101.5)
     assert schedule.next_due_s() == 102.0
-    schedule.sent(0, 105.25)
+    turn(schedule, 105.25)
     assert schedule.next_due_s() == 106.0
 
 
 def test_a_grid_does_not_drift_in_a_million_seconds() -> None:
     schedule = Schedule([0.25])
-    schedule.sent(0, 0.0)
-    now_s = 1_000_000.1
-    schedule.sent(0, now_s)
+    turn(schedule, 0.0)
+    turn(schedule, 1_000_000.1)
     assert schedule.next_due_s() == 1_000_000.25
 
 

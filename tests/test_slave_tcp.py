@@ -16,6 +16,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import pytest
@@ -77,7 +78,7 @@ class Slave:
 
 
 def a_config(**changes: Any) -> SlaveConfig:
-    return SlaveConfig(**({"name": "scada", "line": "tcp://127.0.0.1:502", "unit": 17} | changes))
+    return SlaveConfig.model_validate({"name": "scada", "line": "tcp://127.0.0.1:502", "unit": 17} | changes)
 
 
 def listen() -> socket.socket:
@@ -257,10 +258,10 @@ def needs_ipv6() -> None:
 
 def test_ipv6_clients_are_served_and_named_in_brackets() -> None:
     needs_ipv6()
-    with serving(a_config(allow=["::1/128"]), opening=lambda: listen_tcp("::1", 0)) as slave:
-        with raw_client(slave.port, host="::1") as client:
-            assert client.ask(READ, len(FOUND)) == FOUND
-            assert [known.name for known in slave.task.clients.values()] == [f"[::1]:{client.socket.getsockname()[1]}"]
+    opening = partial(listen_tcp, "::1", 0)
+    with serving(a_config(allow=["::1/128"]), opening=opening) as slave, raw_client(slave.port, "::1") as client:
+        assert client.ask(READ, len(FOUND)) == FOUND
+        assert [known.name for known in slave.task.clients.values()] == [f"[::1]:{client.socket.getsockname()[1]}"]
 
 
 @pytest.mark.parametrize(("network", "is_served"), [("127.0.0.0/8", True), ("10.0.0.0/8", False)])
@@ -271,21 +272,27 @@ def test_an_ipv4_client_on_an_ipv6_port_is_judged_by_its_ipv4_address(network: s
         assert client.is_closed() is not is_served
 
 
-def test_a_client_idle_for_the_timeout_is_closed_and_a_busy_one_is_not() -> None:
-    config = a_config(idle_timeout=0.3)
-    with serving(config, wait_limit_s=NEVER_S) as slave, slave.client() as idle, slave.client() as busy:
-        idle.socket.settimeout(0.1)  # in each 0.1 s that the idle one hears nothing, the busy one asks
-        while True:
+def test_a_client_idle_for_the_timeout_is_closed() -> None:
+    with serving(a_config(idle_timeout=SHORT_S), wait_limit_s=NEVER_S) as slave, slave.client() as client:
+        assert client.is_closed()
+        slave.run.wait_until(lambda: not slave.task.clients)
+
+
+def test_a_client_that_asks_again_and_again_outlives_an_idle_one() -> None:
+    with serving(a_config(idle_timeout=0.5)) as slave, slave.client() as busy, slave.client() as idle:
+        idle.socket.settimeout(0.05)  # the pause between two requests of the busy one
+        is_closed = False
+        while not is_closed:
             assert busy.ask(READ, len(FOUND)) == FOUND
             with contextlib.suppress(TimeoutError):
-                assert idle.is_closed()
-                break
+                is_closed = idle.is_closed()
         assert busy.ask(READ, len(FOUND)) == FOUND
 
 
 def test_an_idle_timeout_of_zero_never_closes() -> None:
     with serving(a_config(idle_timeout=0)) as slave, slave.client() as client:
-        slave.run.wait_turns(2)
+        slave.run.come_round()
+        slave.run.come_round()
         assert client.ask(READ, len(FOUND)) == FOUND
 
 
@@ -352,7 +359,8 @@ def test_in_maintenance_nobody_is_answered_and_afterwards_everybody_again(slave:
 
 def test_a_slave_configured_off_starts_in_maintenance() -> None:
     with serving(a_config(enabled=False)) as slave:
-        slave.run.wait_turns(1)
+        slave.run.come_round()
+        slave.run.come_round()
         assert slave.task.port is None
 
 
@@ -369,7 +377,7 @@ def test_a_port_in_use_is_told_once_and_served_when_it_is_free(caplog: pytest.Lo
             slave.run.wait_until(lambda: slave.task.trouble)
             assert slave.task.trouble == f"tcp 127.0.0.1:{port}: address already in use"
             slave.run.wait_until(lambda: attempts == [port, port])
-            slave.run.wait_turns(1)
+            slave.run.come_round()
             taken.close()
             with slave.client() as client:
                 assert client.ask(READ, len(FOUND)) == FOUND
@@ -540,7 +548,7 @@ def test_the_examples_of_rtu_and_ascii_over_tcp_are_answered_byte_for_byte() -> 
         reply = bytes.fromhex("01 03 06 02 2B 00 00 00 64 05 7A")
         assert client.ask(bytes.fromhex("01 03 00 6B 00 03 74 17"), len(reply)) == reply
     with serving(a_config(framing="ascii", unit=1)) as slave, slave.client() as client:
-        answer = b":010306022B000000645F\r\n"
+        answer = b":010306022B0000006465\r\n"
         assert client.ask(b":0103006B00038E\r\n", len(answer)) == answer
 
 
@@ -590,7 +598,8 @@ def test_a_part_of_a_tcp_frame_is_never_forgotten() -> None:
         client.send(READ[:4])
         (known,) = slave.task.clients.values()
         slave.run.wait_until(lambda: known.framer.pending == 4)
-        slave.run.wait_turns(2)
+        slave.run.come_round()
+        slave.run.come_round()
         assert client.ask(READ[4:], len(FOUND)) == FOUND
 
 
@@ -624,16 +633,15 @@ def test_a_32_bit_value_written_by_one_client_never_tears_for_another() -> None:
                 if pair[:2] != pair[2:]:
                     torn.append(pair)
 
-    with serving(a_config(), register) as one, serving(a_config(name="plc"), register) as two:
-        with raw_client(one.port) as writer:
-            readers = [threading.Thread(target=read_on, args=(slave.port,)) for slave in (one, two, two)]
-            for reader in readers:
-                reader.start()
-            for number in range(2000):
-                word = f"{number:04X}"
-                assert len(writer.ask(tcp_frame(number, f"10 00 0A 00 02 04 {word} {word}"), 12)) == 12
-            done.set()
-            for reader in readers:
-                reader.join()
+    with serving(a_config(), register) as one, serving(a_config(name="plc"), register) as two, one.client() as writer:
+        readers = [threading.Thread(target=read_on, args=(slave.port,)) for slave in (one, two, two)]
+        for reader in readers:
+            reader.start()
+        for number in range(2000):
+            word = f"{number:04X}"
+            assert len(writer.ask(tcp_frame(number, f"10 00 0A 00 02 04 {word} {word}"), 12)) == 12
+        done.set()
+        for reader in readers:
+            reader.join()
     assert not torn
     assert len(seen) > 100  # the readers did look in between

@@ -194,16 +194,16 @@ class RtuRequestFramer:
         return None
 
     def _ends(self, start: int) -> list[int]:
-        """Where a request, and where a reply, that begins at *start* would end; shortest first."""
+        """Where a request, and where a reply, that begins at *start* would end, if not too long; shortest first."""
         head = self._held[start + 1 : start + 12]
         lengths = (pdu_length(shapes, head) for shapes in (REQUEST_SHAPES, REPLY_SHAPES))
-        return sorted({start + 1 + length + 2 for length in lengths if length})
+        return sorted({start + 1 + length + 2 for length in lengths if length and length <= PDU_MAX})
 
     def _is_lost(self, start: int) -> bool:
         """True if no more bytes can turn what begins at *start* into a frame."""
         if len(self._held) - start < 2:
             return False
-        return all(stop <= len(self._held) or stop - start > RTU_MAX for stop in self._ends(start))
+        return all(stop <= len(self._held) for stop in self._ends(start))
 
     def _last_frame(self, start: int) -> Iterator[Frame]:
         """The request at the very end of what has come, after damage; else nothing."""
@@ -256,9 +256,9 @@ class RtuReplyFramer:
         """Return the awaited unit's frame; what follows it stays ``pending``."""
         while self._to_next_start():
             stop = self._end()
-            if stop > len(self._held):
+            if len(self._held) < stop <= RTU_MAX:
                 return None
-            if _good_crc(self._held, 0, stop):
+            if stop <= RTU_MAX and _good_crc(self._held, 0, stop):
                 frame = _cut(self._held, 0, stop)
                 del self._held[:stop]
                 return frame

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 
+from gateway.modbus.framing import Frame, Framer
+
 
 def wire(text: str) -> bytes:
     """Return the bytes of an annotated frame: hexadecimal pairs, and after a # what they say."""
@@ -40,3 +42,16 @@ def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
     """Return *data* cut at *cuts*, positions modulo its length."""
     places = sorted({cut % (len(data) + 1) for cut in cuts} | {0, len(data)})
     return [data[start:stop] for start, stop in itertools.pairwise(places)] or [b""]
+
+
+def one_by_one(data: bytes) -> list[bytes]:
+    """Return *data* in pieces of one byte."""
+    return [bytes([byte]) for byte in data]
+
+
+def drain(framer: Framer) -> list[Frame]:
+    """Return all the frames that *framer* has to give."""
+    found = []
+    while (frame := framer.next_frame()) is not None:
+        found.append(frame)
+    return found

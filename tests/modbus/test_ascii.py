@@ -1,4 +1,7 @@
-"""ASCII frames out of a byte stream: colon, two hexadecimal characters a byte, LRC, CR LF (serial line guide, 2.5.2)."""
+"""ASCII frames out of a byte stream: colon, two hexadecimal characters a byte, LRC, CR LF.
+
+Source: Modbus over Serial Line V1.02, section 2.5.2.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Iterable
 import pytest
 
 from gateway.modbus.framing import AsciiFramer, Frame, lrc8, reply_framer, request_framer
-from tests.modbus import ascii_of, wire
+from tests.modbus import ascii_of, drain, one_by_one, wire
 
 POLL = wire("""
     3A              # a colon
@@ -38,13 +41,8 @@ def received(pieces: Iterable[bytes], framer: AsciiFramer | None = None) -> list
     found = []
     for piece in pieces:
         framer.receive_data(piece)
-        while (frame := framer.next_frame()) is not None:
-            found.append(frame)
+        found += drain(framer)
     return found
-
-
-def one_by_one(data: bytes) -> list[bytes]:
-    return [bytes([byte]) for byte in data]
 
 
 def refused(data: bytes) -> AsciiFramer:
@@ -142,6 +140,9 @@ def test_an_odd_number_of_characters_is_damage() -> None:
 def test_a_character_that_is_no_hexadecimal_digit_is_damage(character: bytes) -> None:
     refused(b":1103006B0003" + character + b"E\r\n")
     refused(b":" + character + b"1103006B00037E\r\n")
+
+
+def test_spaces_between_the_digits_are_damage() -> None:
     refused(b":11 03 00 6B 00 03 7E\r\n")
 
 

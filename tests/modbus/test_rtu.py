@@ -21,7 +21,7 @@ from gateway.modbus.framing import (
     request_framer,
 )
 from gateway.modbus.pdu import REPLY_SHAPES, REQUEST_SHAPES, pdu_length
-from tests.modbus import crc_bit_by_bit, wire, with_crc
+from tests.modbus import crc_bit_by_bit, drain, one_by_one, wire, with_crc
 
 POLL = wire("""
     02      # unit 2
@@ -89,13 +89,6 @@ def damaged(data: bytes) -> bytes:
     return data[:-1] + bytes([data[-1] ^ 0x10])
 
 
-def drain(framer: Framer) -> list[Frame]:
-    found = []
-    while (frame := framer.next_frame()) is not None:
-        found.append(frame)
-    return found
-
-
 def heard(*bursts: bytes, framer: RtuRequestFramer | None = None) -> list[Frame]:
     """What a slave's ear makes of *bursts*, with a silence after each."""
     framer = framer or RtuRequestFramer()
@@ -120,10 +113,6 @@ def answered(pieces: Iterable[bytes], framer: RtuReplyFramer) -> list[Frame]:
         framer.receive_data(piece)
         found += drain(framer)
     return found
-
-
-def one_by_one(data: bytes) -> list[bytes]:
-    return [bytes([byte]) for byte in data]
 
 
 # ------------------------------------------------------------------------------------------------ checksum, encoding
@@ -261,9 +250,10 @@ def test_what_has_a_right_crc_is_one_frame_whatever_its_length(data: bytes) -> N
 
 
 def test_a_frame_of_more_than_256_bytes_is_none() -> None:
-    framer = RtuRequestFramer()
-    assert heard(with_crc("02 41" + " 55" * 253), framer=framer) == []
-    assert (framer.pending, framer.damaged) == (0, 1)
+    for too_long in ("02 41" + " 55" * 253, "02 10 00 00 00 7F FE" + " 55" * 254, "02 03 FC" + " 55" * 252):
+        framer = RtuRequestFramer()
+        assert heard(with_crc(too_long), framer=framer) == []
+        assert (framer.pending, framer.damaged) == (0, 1)
 
 
 def test_a_request_after_a_frame_that_only_silence_ends_is_heard_in_the_same_burst() -> None:
@@ -490,7 +480,18 @@ def test_endless_babble_is_held_up_to_one_frame(babble: bytes) -> None:
     for _ in range(2000 // len(babble) + 2):
         framer.receive_data(babble)
         drain(framer)
-        assert framer.pending < 1 + 2 + 255 + 2  # a byte count of 255, one byte missing
+        assert framer.pending < 256
     framer.receive_data(babble * 20_000 if len(babble) < 4 else babble)
     drain(framer)
-    assert framer.pending < 260
+    assert framer.pending < 256
+
+
+def test_a_start_that_promises_more_than_256_bytes_is_given_up_at_once() -> None:
+    for too_many in (252, 255):  # unit, function, count, so many bytes and CRC would be 257 and 260
+        framer = awaiting()
+        assert answered([bytes([2, 4, too_many]) + VOLTAGES], framer) == [MEASURED]
+        assert answered([with_crc(f"02 04 {too_many:02X}" + " 5A" * too_many)], framer) == []
+        assert framer.pending == 0
+    longest = with_crc("02 04 FB" + " 5A" * 251)
+    assert len(longest) == 256
+    assert answered([longest], awaiting()) == [frame_of(longest)]

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import pytest
 
 from gateway.modbus.framing import Frame, TcpFramer, reply_framer, request_framer
-from tests.modbus import wire
+from tests.modbus import drain, one_by_one, wire
 
 POLL = wire("""
     15 01   # transaction
@@ -59,13 +59,8 @@ def received(pieces: Iterable[bytes], framer: TcpFramer | None = None) -> list[F
     found = []
     for piece in pieces:
         framer.receive_data(piece)
-        while (frame := framer.next_frame()) is not None:
-            found.append(frame)
+        found += drain(framer)
     return found
-
-
-def one_by_one(data: bytes) -> list[bytes]:
-    return [bytes([byte]) for byte in data]
 
 
 @pytest.mark.parametrize(
