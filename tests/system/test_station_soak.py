@@ -123,9 +123,10 @@ def test_three_lines_200_requests_and_4_clients_run_without_an_error(
         def devices() -> list[Device]:
             return [Device(f"device {unit}", unit, moves=moves) for unit in range(1, DEVICES + 1)]
 
+        serial = 'parity = "none"\nbaudrate = 230400\ndata_bits = 8'
         lines = [
-            f'line = "{simulator.add_serial(devices())}"\nparity = "none"\nbaudrate = 230400',
-            f'line = "{simulator.add_serial(devices(), "ascii")}"\nparity = "none"\ndata_bits = 8\nframing = "ascii"\nbaudrate = 230400',
+            f'line = "{simulator.add_serial(devices())}"\n{serial}',
+            f'line = "{simulator.add_serial(devices(), "ascii")}"\n{serial}\nframing = "ascii"',
             f'line = "tcp://127.0.0.1:{simulator.add_tcp(devices())}"',
         ]
         file.write_text(configuration(lines, port))
