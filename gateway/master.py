@@ -24,14 +24,15 @@ from gateway.config import MasterConfig
 from gateway.counters import PollCounters
 from gateway.errors import LinkError, QueueFull
 from gateway.link import Link, Waker, silence_s
-from gateway.modbus.pdu import Request, check_request
+from gateway.modbus.pdu import Request
 from gateway.polls import OFFLINE_AFTER, Device, Poll, ProbeBudget, count_response, polls_of, status_span
 from gateway.register import DataRegister, Quality
 from gateway.schedule import Schedule
-from gateway.transaction import DAMAGED, TIMEOUT, Line, Response, Timing
+from gateway.transaction import DAMAGED, TIMEOUT, Line, Response, Timing, check_asked
 
 COMMANDS_IN_A_ROW: Final = 4  # then one poll goes through
 SUBMIT_LIMIT: Final = 16  # commands from the menu that wait
+SUBMIT_EXPIRE_S: Final = 10.0
 SILENT_TCP_LIMIT: Final = 3  # requests in a row without any answer: a half-open connection, made anew
 PROBE_LEAST_S: Final = 0.1  # a probe that found nothing to send is not tried again without a pause
 STATUS_EVERY_S: Final = 1.0
@@ -41,10 +42,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class Ticket:
-    """A command from the menu, and later its response."""
+    """A command from the menu, and later its response: None if it was never sent or the line was lost."""
 
     unit: int
     request: Request
+    made_s: float
     response: Response | None = None
     done: threading.Event = field(default_factory=threading.Event)
 
@@ -79,6 +81,7 @@ class Master:
         self._opening = Backoff(config.name, clock)
         self._silent_in_row = 0
         self._has_answered = False  # since the line was opened
+        self._is_resting = False  # a connection that worked and was closed: opened again when there is work for it
         scheduled = [poll for poll in self.polls if poll.is_scheduled]
         self._schedule = Schedule([poll.config.every for poll in scheduled])
         self._online = (1 << len(scheduled)) - 1
@@ -116,11 +119,14 @@ class Master:
         self.wake()
 
     def submit(self, unit: int, request: Request) -> Ticket:
-        """Queue a command before all polls. Raises QueueFull, RequestInvalid; the ticket's event tells when done."""
-        check_request(request)
+        """Queue a command before all polls. Raises QueueFull, RequestInvalid; the ticket's event tells when done.
+
+        It is given up, like any command, when it could not be sent within 10 s.
+        """
+        check_asked(unit, request, has_broadcast=self.config.framing_used != "tcp")
         if len(self._submitted) >= SUBMIT_LIMIT:
             raise QueueFull(f"{SUBMIT_LIMIT} commands wait for this line already")
-        ticket = Ticket(unit, request)
+        ticket = Ticket(unit, request, self._clock.monotonic())
         self._submitted.append(ticket)
         self.wake()
         return ticket
@@ -150,6 +156,8 @@ class Master:
         for undo in self._undo:
             undo()
         self._undo.clear()
+        while self._submitted:
+            self._submitted.popleft().done.set()
 
     def step(self) -> None:
         """Do one thing: a command, a poll, a probe, opening the line; or wait for the next."""
@@ -178,7 +186,7 @@ class Master:
     def _wait_s(self) -> float:
         """How long nothing is due."""
         due_s = [self._clock.monotonic() + self._wait_limit_s]
-        if self.enabled and self._line is not None:
+        if self.enabled and (self._line is not None or self._is_resting):
             due_s.append(self._schedule.next_due_s() or due_s[0])
             if self._offline:
                 due_s.append(self._probes.due_s())
@@ -191,8 +199,8 @@ class Master:
 
     def _open(self) -> None:
         wait_s = self._opening.wait_s()
-        if wait_s:
-            self._waker.wait(min(self._wait_s(), wait_s))
+        if wait_s or (self._is_resting and not self._is_work_due()):
+            self._waker.wait(min(self._wait_s(), wait_s or self._wait_limit_s))
             return
         try:
             self._link = self._open_link()
@@ -204,9 +212,13 @@ class Master:
         log.debug("%s: polling on %s", self.name, self.config.line)
         self._line = Line(self._link, self.config.framing_used, self._timing(self._link), self._clock)
         self._silent_in_row = 0
-        self._has_answered = False
+        self._has_answered = self._is_resting = False
         if not self.config.is_tcp:  # a connection has to prove itself by an answer
             self._opening.worked()
+
+    def _is_work_due(self) -> bool:
+        is_probe_due = bool(self._offline) and self._clock.monotonic() >= self._probes.due_s()
+        return bool(self._submitted) or len(self._queue) > 0 or is_probe_due or self._poll_due() is not None
 
     def _timing(self, link: Link) -> Timing:
         config = self.config
@@ -220,7 +232,7 @@ class Master:
         )
 
     def _broke(self, reason: str) -> None:
-        """A connection that worked is made anew at once: devices close idle ones. Another is in trouble."""
+        """A connection that worked is made anew: devices close idle ones. Another is in trouble."""
         if self._has_answered:
             self._renew(reason)
         else:
@@ -228,11 +240,13 @@ class Master:
 
     def _renew(self, reason: str) -> None:
         log.debug("%s: %s; opening it anew", self.name, reason)
+        self._is_resting = self.config.is_tcp
         self._let_go()
 
     def _lost(self, reason: str) -> None:
         """The line is not to be had: say so once, spoil all points, try again later and later."""
         self._let_go()
+        self._is_resting = False
         if self._opening.failed(reason):
             for poll in self.polls:
                 if poll.config.is_read:
@@ -249,15 +263,16 @@ class Master:
     def _carry_out_command(self, line: Line) -> bool:
         if self._commands_in_row >= COMMANDS_IN_A_ROW and self._poll_due() is not None:
             return False
+        self._commands_in_row += 1  # also of one that ends the connection: polls go on after 4
         if self._submitted:
             self._carry_out_ticket(line, self._submitted.popleft())
-        else:
-            held_back = {outlet for device in self._offline for outlet in device.outlets}
-            command = self._queue.take(held_back)
-            if command is None:
-                return False
-            self._send_command(line, command)
-        self._commands_in_row += 1
+            return True
+        held_back = {outlet for device in self._offline for outlet in device.outlets}
+        command = self._queue.take(held_back)
+        if command is None:
+            self._commands_in_row -= 1
+            return False
+        self._send_command(line, command)
         return True
 
     def _carry_out_probe(self, line: Line) -> bool:
@@ -365,6 +380,8 @@ class Master:
             ticket.done.set()
         if ticket.response is not None:
             count_response(self.counters, ticket.response)
+            if ticket.unit in self.devices:
+                self._judge(self.devices[ticket.unit], ticket.response)
 
     def _ask(self, line: Line, poll: Poll, request: Request) -> Response | None:
         """Send *request* and wait for what becomes of it; None when stopped on the way."""
@@ -427,6 +444,10 @@ class Master:
             poll.counters.expired += 1
             self.counters.expired += 1
             log.warning("%s: point %d not written: not delivered in time", poll.source, command.span.start)
+        while self._submitted and self._clock.monotonic() >= self._submitted[0].made_s + SUBMIT_EXPIRE_S:
+            ticket = self._submitted.popleft()
+            log.warning("%s: unit %d: a command of the menu not sent in time", self.name, ticket.unit)
+            ticket.done.set()
 
     def _show_status(self) -> None:
         """Keep the status points up to date: once a second."""

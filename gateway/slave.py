@@ -226,6 +226,7 @@ class TcpSlave:
         self.server = server_of(config, register)
         self.clients: dict[int, Client] = {}
         self.refused_clients = 0
+        self.port: int | None = None  # that is listened on; None while it is not
         self._clock = clock
         self._waker = waker
         self._listen = listen
@@ -245,11 +246,6 @@ class TcpSlave:
     def trouble(self) -> str:
         """Why nothing can be served, for people; "" while it can."""
         return self._opening.trouble
-
-    @property
-    def port(self) -> int | None:
-        """The TCP port that is listened on; None while it is not."""
-        return int(self._listener.getsockname()[1]) if self._listener else None
 
     def wake(self) -> None:
         """End any wait of this slave's thread."""
@@ -299,6 +295,7 @@ class TcpSlave:
         finally:
             self.ready.set()
         self._opening.worked()
+        self.port = self._listener.getsockname()[1]
         self._selector.register(self._listener, selectors.EVENT_READ)
         log.info("%s: listening on %s", self.name, self.config.line)
 
@@ -308,7 +305,7 @@ class TcpSlave:
         if self._listener is not None:
             self._selector.unregister(self._listener)
             self._listener.close()
-            self._listener = None
+            self._listener = self.port = None
 
     # -------------------------------------------------------------------------------------------- time
 

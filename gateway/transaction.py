@@ -225,11 +225,7 @@ class Line:
         """
         if self._asked is not None or self._done is not None:
             return False
-        if not 0 <= unit <= 255:
-            raise RequestInvalid(f"unit {unit} is not within 0 to 255")
-        pdu.check_request(request)
-        if self._is_broadcast(unit) and not isinstance(request, WriteRequest):
-            raise RequestInvalid("a broadcast (unit 0) can only write: nobody answers it")
+        check_asked(unit, request, has_broadcast=not self._has_transactions)
         self._asked = _Asked(unit, request, timeout_s or self._timing.response_timeout_s)
         if self.state is State.IDLE:
             self._hold_back()
@@ -271,9 +267,9 @@ class Line:
             case State.HELD_BACK:
                 return self._silent_s()
             case State.AWAITING:
-                if self._framer.pending or self._is_damaged:
+                if self._has_begun and not self._has_transactions:
                     return min(self._heard_s + timing.character_timeout_s, self._last_chance_s())
-                return self._deadline_s()
+                return self._last_chance_s() if self._framer.pending else self._deadline_s()
             case State.CONFIRMING:
                 return self._heard_s + timing.silence_s
             case State.TURNAROUND | State.SPOILED:
@@ -282,9 +278,9 @@ class Line:
                 return None
 
     @property
-    def _is_damaged(self) -> bool:
-        """True if part of what came was no reply; on Modbus TCP the right one may still come."""
-        return self._framer.damaged > 0 and not self._has_transactions
+    def _has_begun(self) -> bool:
+        """True if something came that is, or was to be, part of a reply; on Modbus TCP the right one may still come."""
+        return self._framer.pending > 0 or (self._framer.damaged > 0 and not self._has_transactions)
 
     def _silent_s(self) -> float:
         return self._quiet_since_s + self._timing.silence_s + self._timing.delay_s
@@ -362,19 +358,24 @@ class Line:
                     self._hold_back()
 
     def _wait_no_longer(self, now_s: float) -> None:
-        if self._framer.pending and now_s >= self._heard_s + self._timing.character_timeout_s:
-            self._framer.silence()
-            self._look_for_reply()
+        is_quiet = not self._has_transactions and now_s >= self._heard_s + self._timing.character_timeout_s
+        if is_quiet and self._framer.pending:
+            self._look_behind_false_starts()
         if self.state is not State.AWAITING:
             return
         late = self._last_chance_s() if self._framer.pending else self._deadline_s()
-        if now_s >= late:
-            if self._is_damaged or self._framer.pending:
-                self._fail(Event.DAMAGE, DAMAGED, "what came was no undamaged reply")
-            else:
-                self._fail(Event.TIMEOUT, TIMEOUT, "no reply")
-        elif self._is_damaged and now_s >= self._heard_s + self._timing.character_timeout_s:
+        if self._has_begun and (is_quiet or now_s >= late):
             self._fail(Event.DAMAGE, DAMAGED, "what came was no undamaged reply")
+        elif now_s >= late:
+            self._fail(Event.TIMEOUT, TIMEOUT, "no reply")
+
+    def _look_behind_false_starts(self) -> None:
+        """After a pause: what looked like the start of the reply goes no further, but the reply may stand behind it."""
+        before = self._framer.pending + 1
+        while self.state is State.AWAITING and 0 < self._framer.pending < before:
+            before = self._framer.pending
+            self._framer.silence()
+            self._look_for_reply()
 
     def _hold_back(self) -> None:
         self._pass(Event.ASKED)
@@ -432,6 +433,15 @@ class Line:
     def _tell(self, sent: bool, data: bytes) -> None:
         if self._traffic is not None:
             self._traffic(sent, data)
+
+
+def check_asked(unit: int, request: Request, has_broadcast: bool) -> None:
+    """Raise RequestInvalid unless *request* can be sent to *unit*; *has_broadcast*: unit 0 is all, and none answers."""
+    if not 0 <= unit <= 255:
+        raise RequestInvalid(f"unit {unit} is not within 0 to 255")
+    pdu.check_request(request)
+    if has_broadcast and unit == BROADCAST and not isinstance(request, WriteRequest):
+        raise RequestInvalid("a broadcast (unit 0) can only write: nobody answers it")
 
 
 def _words(values: Sequence[int]) -> bytes:

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
-from gateway.link import Waker
+from gateway.config import MasterConfig
+from gateway.errors import LinkError, LinkLost
+from gateway.link import Link, Waker
+from gateway.master import Master
+from gateway.modbus.pdu import Span, Table
+from gateway.register import DataRegister, Quality, Source, SourceKind
 
 
 class JumpingClock:
@@ -208,3 +214,88 @@ class FakeField:
     def count(self, unit: int) -> int:
         """How many requests *unit* was sent."""
         return sum(asked == unit for _, asked, _ in self.asked)
+
+
+SCADA = Source(SourceKind.CLIENT, "scada 10.0.0.5:40232")
+
+
+class LosableLink(ScriptedLink):
+    """A ScriptedLink that is lost, once, at the next read or write after *lose* is set."""
+
+    lose: str = ""  # "read", "write" or ""
+
+    def _lose_at(self, what: str) -> None:
+        if self.lose == what:
+            self.lose = ""
+            raise LinkLost("the port is gone")
+
+    def write(self, data: bytes) -> None:
+        self._lose_at("write")
+        super().write(data)
+
+    def read(self, timeout_s: float) -> bytes:
+        if timeout_s > 0:
+            self._lose_at("read")
+        return super().read(timeout_s)
+
+
+class MasterBench:
+    """A master on a fake line with fake devices. *missing*: why the line cannot be opened, while it cannot."""
+
+    def __init__(self, clock: JumpingClock, *requests: dict[str, Any], **line: Any) -> None:
+        self.clock = clock
+        self.register = DataRegister(clock)
+        settings = {"name": "field", "line": "/dev/ttyS2", "baudrate": 19200, **line, "request": list(requests)}
+        self.config = MasterConfig.model_validate(settings)
+        self.field = FakeField(clock, self.config.framing_used)
+        self.missing: LinkError | None = None
+        self.links: list[LosableLink] = []
+        self.opened_s: list[float] = []
+        self.waker = JumpingWaker(clock)
+        self.master = Master(self.config, self.register, clock, self.waker, self._open)
+
+    def _open(self) -> Link:
+        self.opened_s.append(self.clock.monotonic())
+        if self.missing is not None:
+            raise self.missing
+        self.links.append(LosableLink(self.clock, self.field))
+        return self.links[-1]
+
+    @property
+    def link(self) -> LosableLink:
+        return self.links[-1]
+
+    def run_s(self, seconds: float, meanwhile: Callable[[], None] = lambda: None) -> None:
+        """Step for *seconds* of the fake clock; *meanwhile* before each step."""
+        until_s = self.clock.monotonic() + seconds
+        steps = 0
+        while self.clock.monotonic() < until_s:
+            meanwhile()
+            self.master.step()
+            steps += 1
+            assert steps < 1000 + 2000 * seconds, "the master turns without waiting"
+
+    def steps(self, count: int) -> None:
+        for _ in range(count):
+            self.master.step()
+
+    def scada(self, start: int, *values: int, table: Table = Table.HOLDING_REGISTERS) -> None:
+        """Write registers (or one coil a value, up to 8) as the upper side does."""
+        data = bytes([sum(v << i for i, v in enumerate(values))]) if table.is_bits else words(*values)
+        self.register.write(Span(table, start, len(values)), data, SCADA)
+
+    def values(self, start: int, count: int = 1, table: Table = Table.HOLDING_REGISTERS) -> list[int]:
+        return [sample.value for sample in self.register.samples(Span(table, start, count))]
+
+    def qualities(self, start: int, count: int = 1, table: Table = Table.HOLDING_REGISTERS) -> set[Quality]:
+        return {sample.quality for sample in self.register.samples(Span(table, start, count))}
+
+
+def reads(unit: int, point: int, count: int = 1, **settings: Any) -> dict[str, Any]:
+    """A request that reads *count* holding registers from address 0 of *unit* to *point*."""
+    return {"unit": unit, "function": 3, "address": 0, "count": count, "point": point, **settings}
+
+
+def writes(unit: int, point: int, count: int = 1, **settings: Any) -> dict[str, Any]:
+    """A request that writes *count* holding registers from *point*, when changed, to address 0 of *unit*."""
+    return {**reads(unit, point, count), "function": 16, "trigger": "change", **settings}

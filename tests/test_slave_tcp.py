@@ -357,6 +357,22 @@ def test_in_maintenance_nobody_is_answered_and_afterwards_everybody_again(slave:
         assert again.ask(READ, len(FOUND)) == FOUND
 
 
+def test_the_port_may_be_asked_for_while_it_comes_and_goes(slave: Slave) -> None:
+    enough = threading.Event()
+
+    def toggle() -> None:
+        for number in range(200):
+            slave.task.set_enabled(bool(number % 2))
+            slave.run.come_round()
+        enough.set()
+
+    toggler = threading.Thread(target=toggle)
+    toggler.start()
+    while not enough.is_set():
+        assert slave.task.port is None or slave.task.port > 0
+    toggler.join()
+
+
 def test_a_slave_configured_off_starts_in_maintenance() -> None:
     with serving(a_config(enabled=False)) as slave:
         slave.run.come_round()
@@ -367,18 +383,21 @@ def test_a_slave_configured_off_starts_in_maintenance() -> None:
 def test_a_port_in_use_is_told_once_and_served_when_it_is_free(caplog: pytest.LogCaptureFixture) -> None:
     with contextlib.closing(listen()) as taken:
         port = taken.getsockname()[1]
-        attempts: list[int] = []
+        tried = threading.Semaphore(0)
 
         def opening() -> socket.socket:
-            attempts.append(port)
-            return listen_tcp("127.0.0.1", port)
+            try:
+                return listen_tcp("127.0.0.1", port)
+            finally:
+                tried.release()
 
-        with serving(a_config(), opening=opening) as slave:
-            slave.run.wait_until(lambda: slave.task.trouble)
-            assert slave.task.trouble == f"tcp 127.0.0.1:{port}: address already in use"
-            slave.run.wait_until(lambda: attempts == [port, port])
+        with serving(a_config(), opening=opening, wait_limit_s=NEVER_S) as slave:
+            assert tried.acquire(timeout=PATIENCE_S)
+            assert tried.acquire(timeout=PATIENCE_S)  # 0.5 s later, by itself
             slave.run.come_round()
+            assert slave.task.trouble == f"tcp 127.0.0.1:{port}: address already in use"
             taken.close()
+            assert tried.acquire(timeout=PATIENCE_S)  # another 1 s later
             with slave.client() as client:
                 assert client.ask(READ, len(FOUND)) == FOUND
             assert slave.task.trouble == ""
@@ -594,7 +613,7 @@ def test_a_part_of_a_serial_frame_over_tcp_is_forgotten_and_counted_after_the_ch
 
 
 def test_a_part_of_a_tcp_frame_is_never_forgotten() -> None:
-    with serving(a_config(character_timeout=0.001)) as slave, slave.client() as client:
+    with serving(a_config(character_timeout=1e-6)) as slave, slave.client() as client:
         client.send(READ[:4])
         (known,) = slave.task.clients.values()
         slave.run.wait_until(lambda: known.framer.pending == 4)

@@ -43,7 +43,7 @@ class Bench:
 
     def __post_init__(self) -> None:
         self.link = ScriptedLink(self.clock, self._device, self.timing.character_s)
-        self.line = Line(self.link, self.framing, self.timing, self.clock, lambda sent, data: self._note(sent, data))
+        self.line = Line(self.link, self.framing, self.timing, self.clock, self._note)
 
     def _note(self, sent: bool, data: bytes) -> None:
         self.traffic.append((sent, data))

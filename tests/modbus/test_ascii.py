@@ -107,11 +107,13 @@ def test_lower_case_is_accepted() -> None:
 
 
 def test_a_colon_begins_a_new_frame_wherever_it_comes() -> None:
-    for stop in range(len(POLL) - 1):
-        framer = AsciiFramer()
-        assert received([POLL[:stop] + POLL], framer) == [POLLED]
-        assert received(one_by_one(POLL[:stop] + POLL)) == [POLLED]
-        assert framer.damaged == 0
+    longest = AsciiFramer().encode(LONGEST)
+    for data, frame, stops in ((POLL, POLLED, range(len(POLL) - 1)), (longest, LONGEST, (400, 511))):
+        for stop in stops:
+            framer = AsciiFramer()
+            assert received([data[:stop] + data], framer) == [frame]
+            assert received(one_by_one(data[:stop] + data), framer) == [frame]
+            assert framer.damaged == 0
 
 
 @pytest.mark.parametrize("noise", [b"\x00", b"\xff\xfe", b"1103", b"\r", b"\n", b"hello "])

@@ -205,7 +205,9 @@ def test_a_request_is_heard_byte_by_byte_and_two_at_once() -> None:
         framer.receive_data(byte)
         assert framer.next_frame() is None
     framer.silence()
-    assert drain(framer) == [POLLED]
+    framer.receive_data(TO_ALL)
+    framer.silence()
+    assert drain(framer) == [POLLED, frame_of(TO_ALL)]  # what nobody fetched yet is not lost
     assert heard(POLL + POLL) == [POLLED, POLLED]
 
 
@@ -366,6 +368,7 @@ def test_a_line_that_never_rests_fills_no_more_than_4096_bytes() -> None:
         (with_crc("02 05 00 AC FF 00"), 2, 5),
         (with_crc("02 16 00 04 00 F2 00 25"), 2, 22),
         (with_crc("02 17 04 00 FE 0A CD"), 2, 23),
+        (with_crc("02 18 00 06 00 02 01 B8 12 84"), 2, 24),
         (with_crc("02 03 00  # no data at all: its request will tell that this is wrong"), 2, 3),
         (with_crc("02 03 FA" + " 5A" * 250), 2, 3),
     ],
