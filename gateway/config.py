@@ -308,6 +308,11 @@ class IdentityConfig(Section):
     revision: Text = ""
 
 
+EVENT_BLOCK_HEAD: Final = 3  # acknowledge, waiting, lost
+EVENT_ENTRY: Final = 7  # registers of one change: number, table, point, value, time (3)
+EVENT_BLOCK_ENTRIES: Final = 17  # 3 + 17 x 7 = 122 registers: one read
+
+
 class EventsConfig(Section):
     """[events]: the queue of changes for the upper side."""
 
@@ -411,3 +416,9 @@ class Config(Section):
     hmi: HmiConfig = HmiConfig()
     watchdog: WatchdogConfig = WatchdogConfig()
     log: LogConfig = LogConfig()
+
+    @property
+    def event_block_registers(self) -> int:
+        """How many holding registers the event block takes: 3, and 7 an entry, 17 entries at most, one at least."""
+        room = self.register_.holding_registers - self.events.block_point - EVENT_BLOCK_HEAD
+        return EVENT_BLOCK_HEAD + EVENT_ENTRY * min(EVENT_BLOCK_ENTRIES, max(1, room // EVENT_ENTRY))

@@ -21,7 +21,6 @@ from gateway.config import (
     FUNCTION_NAMES,
     TABLE_NAMES,
     Config,
-    IdentityConfig,
     LineConfig,
     MasterConfig,
     RequestConfig,
@@ -32,7 +31,9 @@ from gateway.modbus.pdu import Table
 
 ADDRESSES: Final = 65536  # application protocol V1.1b3, section 4.4
 STATUS_REGISTERS: Final = 4  # specification, section 3
-BLOCK_REGISTERS: Final = 3  # acknowledge, waiting, lost: what stands before the entries
+BLOCK_REGISTERS: Final = (
+    122  # acknowledge, waiting, lost, and 17 entries of 7: see events.py, which may not be asked here
+)
 DEVICE_MARGIN_S: Final = 15  # reference.toml, [watchdog]
 
 REFERENCES: Final = {  # how handbooks number points; coils (1 to 9999) cannot be told from addresses
@@ -72,17 +73,10 @@ def not_yet(config: Config) -> list[Finding]:
     """Return a warning for everything in *config* that this version accepts and does not carry out."""
     asked: list[tuple[Path, bool]] = [
         (("register", "retain"), bool(config.register_.retain)),
-        (("identity",), config.identity != IdentityConfig()),
-        (("events",), config.events.fifo_point >= 0 or config.events.block_point >= 0),
         (("hmi", "serial"), bool(config.hmi.serial.line)),
         (("hmi", "telnet"), "telnet" in config.hmi.model_fields_set and bool(config.hmi.telnet.listen)),
         (("hmi", "wifly"), bool(config.hmi.wifly.line)),
         (("watchdog", "device"), bool(config.watchdog.device)),
-    ]
-    asked += [
-        (("master", i, "request", j, "events"), request.events)
-        for i, master in enumerate(config.master)
-        for j, request in enumerate(master.request)
     ]
     asked += [(("io", i), True) for i in range(len(config.io))]
     return [Finding(path, _not_carried_out(path), "warning") for path, is_asked in asked if is_asked]
@@ -356,7 +350,7 @@ def _beyond(config: Config, table: Table, start: int, count: int, path: Path) ->
 def _own_points(config: Config) -> Iterator[Finding]:
     for i, io in enumerate(config.io):
         yield from _beyond(config, io.target, io.point, 1, ("io", i, "point"))
-    for key, count in (("fifo_point", 1), ("block_point", BLOCK_REGISTERS)):
+    for key, count in (("fifo_point", 1), ("block_point", config.event_block_registers)):
         point = getattr(config.events, key)
         if point >= 0:
             yield from _beyond(config, Table.HOLDING_REGISTERS, point, count, ("events", key))
@@ -401,7 +395,9 @@ def _uses(config: Config) -> Iterator[_Use]:
         yield _Use(io.target, io.point, 1, "fill" if io.is_input else "take", f'io "{io.name}"', ("io", i, "point"))
     if config.events.block_point >= 0:
         block = ("events", "block_point")
-        yield _Use(Table.HOLDING_REGISTERS, config.events.block_point, BLOCK_REGISTERS, "fill", "[events]", block)
+        yield _Use(
+            Table.HOLDING_REGISTERS, config.events.block_point, config.event_block_registers, "fill", "[events]", block
+        )
 
 
 def _overlaps(config: Config) -> Iterator[Finding]:

@@ -17,11 +17,14 @@ import threading
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 from gateway.clock import SystemClock
+from gateway.config import SlaveConfig
+from gateway.link import Waker, listen_tcp
 from gateway.modbus.pdu import Span, Table
 from gateway.register import DataRegister, Source, SourceKind
+from gateway.slave import TcpSlave
 
 PATIENCE_S = 5.0  # for what must happen; a test that needs it has failed
 STOP_LIMIT_S = 2.0  # spec section 7: a clean stop takes under 2 s
@@ -53,6 +56,10 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "range that wraps around": ("03 FF FF 00 02", "83 02"),
     "coil value neither on nor off": ("05 00 00 12 34", "85 03"),
 }
+READ_PDU, FOUND_PDU = EXAMPLES["read holding registers, 6.3"]
+# The same on TCP: transaction 1, protocol 0, 6 bytes, unit 17, read 3 holding registers from 107.
+READ = bytes.fromhex("0001 0000 0006 11 03 006B 0003")
+FOUND = bytes.fromhex("0001 0000 0009 11 03 06 022B 0000 0064")
 
 
 def a_register() -> DataRegister:
@@ -224,6 +231,58 @@ def raw_client(port: int | None, host: str = "127.0.0.1", source: str = "") -> I
     assert port is not None, "the slave does not listen"
     with contextlib.closing(RawClient(port, host, source)) as client:
         yield client
+
+
+class ServedTcp:
+    """A TCP slave that runs, and the register it serves."""
+
+    def __init__(self, task: TcpSlave, run: Running, register: DataRegister) -> None:
+        self.task, self.run, self.register = task, run, register
+
+    @property
+    def port(self) -> int:
+        """The port, once it is listened on."""
+        self.task.wake()
+        self.run.wait_until(lambda: self.task.port)
+        assert self.task.port is not None
+        return self.task.port
+
+    @contextmanager
+    def client(self, source: str = "") -> Iterator[RawClient]:
+        """Give a client whom the slave has accepted."""
+        before = set(self.task.clients.values())
+        with raw_client(self.port, source=source) as client:
+            self.run.wait_until(lambda: set(self.task.clients.values()) - before)
+            yield client
+
+
+def tcp_config(**changes: Any) -> SlaveConfig:
+    """Return a slave's configuration; *changes* by key."""
+    return SlaveConfig.model_validate({"name": "scada", "line": "tcp://127.0.0.1:502", "unit": 17} | changes)
+
+
+def listen() -> socket.socket:
+    """Listen on a port that the system chooses."""
+    return listen_tcp("127.0.0.1", 0)
+
+
+@contextmanager
+def serving_tcp(
+    config: SlaveConfig,
+    register: DataRegister | None = None,
+    opening: Callable[[], socket.socket] = listen,
+    wait_limit_s: float = 0.02,
+) -> Iterator[ServedTcp]:
+    """Give a TCP slave that runs.
+
+    wait_limit_s: how often it comes round by itself, so that a test soon learns what it has done; much longer where
+                  its own deadlines, or a wake, have to end its wait.
+    """
+    register = register or a_register()
+    with contextlib.closing(Waker()) as waker:
+        task = TcpSlave(config, register, CLOCK, waker, opening, wait_limit_s)
+        with running(task) as run:
+            yield ServedTcp(task, run, register)
 
 
 # ------------------------------------------------------------------------------------------------ ptys

@@ -316,7 +316,7 @@ def test_what_is_wrong_with_a_slave_is_said_plainly(keys: dict[str, Any], messag
         ),
         (
             {"events": {"block_point": 1998}},
-            "block_point 1998 with 3 points goes beyond holding-registers, which end at 1999",
+            "block_point 1998 with 10 points goes beyond holding-registers, which end at 1999",
         ),
         ({"events": {"fifo_point": 2000}}, "fifo_point 2000 lies beyond holding-registers, which end at 1999"),
         ({"io": [IO | {"point": 2000}]}, "point 2000 lies beyond discrete-inputs, which end at 1999"),

@@ -345,10 +345,6 @@ def test_polls_that_do_not_fit_their_line_are_a_warning() -> None:
     ("data", "path"),
     [
         ({"register": {"retain": ["coils"]}}, ("register", "retain")),
-        ({"identity": {"vendor": "me"}}, ("identity",)),
-        ({"events": {"fifo_point": 5}}, ("events",)),
-        ({"events": {"block_point": 5}}, ("events",)),
-        (with_requests({"events": True}), ("master", 0, "request", 0, "events")),
         ({"io": [IO]}, ("io", 0)),
         ({"hmi": {"serial": {"line": "/dev/ttyS3"}}}, ("hmi", "serial")),
         ({"hmi": {"telnet": {}}}, ("hmi", "telnet")),

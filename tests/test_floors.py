@@ -12,9 +12,19 @@ import gateway
 ROOT = Path(gateway.__file__).parent
 
 FLOORS = [  # from the ground up; within a floor, in the order they may build on each other
-    ["errors", "clock", "counters", "schedule", "backoff", "modbus.pdu", "modbus.framing"],
+    [
+        "errors",
+        "clock",
+        "counters",
+        "schedule",
+        "backoff",
+        "modbus.pdu",
+        "modbus.framing",
+        "modbus.diagnostics",
+        "modbus.identification",
+    ],
     ["register", "toml_text", "config_fields", "config", "line_load", "config_checks"],
-    ["commands", "modbus.server", "transaction", "link", "polls", "store"],
+    ["commands", "events", "modbus.server", "transaction", "link", "polls", "store"],
     ["master", "slave", "supervisor", "simulator"],
     ["wiring"],
     ["demo", "cli"],

@@ -116,7 +116,7 @@ def test_a_silent_device_is_sent_the_same_command_again(clock: JumpingClock) -> 
 def test_a_write_that_finds_the_queue_full_is_refused_whole(clock: JumpingClock) -> None:
     it = MasterBench(clock, writes(9, 0, 120, address=0), enabled=False)
     refused = 0
-    for point in range(0, 120):
+    for point in range(120):
         try:
             it.scada(point, 1)
         except QueueFull:
@@ -285,6 +285,22 @@ def test_a_cyclic_write_carries_scadas_value_even_if_polls_come_between(clock: J
     it.run_s(3.0)
     assert written(it)[0] == (3, 0, [100, 2])
     assert it.values(300, 2) == [100, 2]
+
+
+def test_a_value_written_while_the_cyclic_request_is_on_its_way_goes_with_the_next(clock: JumpingClock) -> None:
+    it = MasterBench(clock, reads(3, 300, every=0.1), cyclic(3, 300, every=1.0))
+    it.scada(300, 1)
+
+    def write_again(unit: int, pdu: bytes) -> None:
+        if pdu[0] == 16 and pdu[-1] == 1:
+            it.scada(300, 2)
+
+    it.field.during = write_again
+    it.run_s(0.9)
+    assert it.field.registers[3, 0] == 1
+    assert it.values(300) == [2]  # though the device has been read nine times
+    it.run_s(1.0)
+    assert written(it) == [(3, 0, [1]), (3, 0, [2])]
 
 
 def test_a_cyclic_write_bridges_what_one_device_says_to_another(clock: JumpingClock) -> None:

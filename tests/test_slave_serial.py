@@ -15,15 +15,19 @@ from typing import Any
 
 import pytest
 
+from gateway.clock import Clock
 from gateway.config import SlaveConfig
 from gateway.errors import LinkLost
 from gateway.link import Link, SerialSettings, Waker, open_serial
 from gateway.modbus.pdu import Table
 from gateway.slave import SerialSlave
+from tests.fakes import JumpingClock
 from tests.lines import (
     CLOCK,
     EXAMPLES,
+    FOUND_PDU,
     PATIENCE_S,
+    READ_PDU,
     Pty,
     Running,
     a_register,
@@ -38,7 +42,6 @@ from tests.lines import (
 SHORT_S = 0.05  # a timeout that a test waits for
 NEVER_S = 60.0  # a timeout that no test waits for
 ENCODE: dict[str, Callable[[str, int], bytes]] = {"rtu": rtu_frame, "ascii": ascii_frame}
-READ_PDU, FOUND_PDU = EXAMPLES["read holding registers, 6.3"]
 WRITE_PDU = "06 00 01 00 03"  # register 1 becomes 3
 FOREIGN = 18
 
@@ -69,13 +72,13 @@ class TappedLink:
 class Slave:
     """A running slave, its end of the wire, and what it serves."""
 
-    def __init__(self, config: SlaveConfig, path: str, waker: Waker) -> None:
+    def __init__(self, config: SlaveConfig, path: str, waker: Waker, clock: Clock) -> None:
         self.config, self.path, self.waker = config, path, waker
         self.register = a_register()
         self.attempts = 0
         self.opened = threading.Event()  # what is sent before is thrown away at opening
         self.tap: TappedLink | None = None
-        self.task = SerialSlave(config, self.register, CLOCK, waker, self._open, wait_limit_s=NEVER_S)
+        self.task = SerialSlave(config, self.register, clock, waker, self._open, wait_limit_s=NEVER_S)
         self.run: Running
         self.pty: Pty
 
@@ -85,6 +88,11 @@ class Slave:
         self.tap = TappedLink(open_serial(settings, self.waker, CLOCK))
         self.opened.set()
         return self.tap
+
+    @property
+    def heard(self) -> bytes:
+        """All that has come since the port was opened."""
+        return b"".join(self.tap.reads) if self.tap else b""
 
     def encode(self, pdu: str, unit: int = 17) -> bytes:
         return ENCODE[self.config.framing_used](pdu, unit)
@@ -114,18 +122,18 @@ def a_config(**changes: Any) -> SlaveConfig:
 
 
 @contextmanager
-def started(config: SlaveConfig, path: str) -> Iterator[Slave]:
+def started(config: SlaveConfig, path: str, clock: Clock = CLOCK) -> Iterator[Slave]:
     """Give a slave that runs, whether it can open *path* or not."""
     with contextlib.closing(Waker()) as waker:
-        slave = Slave(config, path, waker)
+        slave = Slave(config, path, waker, clock)
         with running(slave.task) as slave.run:
             yield slave
 
 
 @contextmanager
-def serving(**changes: Any) -> Iterator[Slave]:
+def serving(clock: Clock = CLOCK, **changes: Any) -> Iterator[Slave]:
     """Give a slave that listens on a pty."""
-    with pty_pair() as pty, started(a_config(**changes), pty.device) as slave:
+    with pty_pair() as pty, started(a_config(**changes), pty.device, clock) as slave:
         slave.pty = pty
         assert slave.opened.wait(PATIENCE_S)
         yield slave
@@ -223,6 +231,21 @@ def test_an_own_request_that_others_talk_follows_in_the_same_burst_is_too_late(f
         assert slave.pty.is_silent()
         assert slave.answers()  # the next that comes is this one's reply
         assert holding(slave.register, 1) == [0]
+
+
+def test_a_wake_does_not_cut_the_silence_short(clock: JumpingClock) -> None:
+    with serving(clock) as slave:
+        request = slave.encode(WRITE_PDU)
+        slave.send(request)
+        slave.run.wait_until(lambda: slave.heard == request)
+        slave.run.come_round()
+        slave.run.come_round()
+        slave.send(slave.encode(READ_PDU, FOREIGN))  # for the slave no time has passed: one burst
+        slave.run.wait_until(lambda: len(slave.heard) > len(request))
+        clock.pass_s(0.1)
+        slave.run.wait_until(lambda: slave.task.counters.unanswered == 1)
+        assert slave.task.counters.requests == 0
+        assert slave.pty.is_silent()
 
 
 @both_framings

@@ -1,6 +1,6 @@
 """What a serial line counts and logs, and the functions that tell it: 7, 8, 11, 12 and 17.
 
-They belong to the serial line only: a server on Modbus TCP has no ``LineDiagnostics`` and answers them with exception 1.
+They belong to the serial line only: a server on Modbus TCP has no ``LineDiagnostics`` and does not know them.
 Pure: numbers and bytes. Words and bits of the register are ``server``'s affair.
 
 Source: application protocol V1.1b3, sections 6.7 to 6.10 and 6.13; counters: serial line guide V1.02, appendix A.
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.errors import RequestRefused
-from gateway.modbus.pdu import ExceptionCode, word_at
+from gateway.modbus.pdu import ExceptionCode, pack_words, word_at
 
 LINE_FUNCTIONS: Final = frozenset({7, 8, 11, 12, 17})
 EVENTS_KEPT: Final = 64  # section 6.10
@@ -112,31 +112,34 @@ class LineDiagnostics:
 
 @dataclass(frozen=True)
 class LineReply:
-    """What one of these functions answers, and what is done after the answer has been counted."""
+    """A reply PDU, whether it is sent at all, and what is done after it has been counted."""
 
-    body: bytes
+    reply: bytes
     silent: bool = False
     then: Callable[[], None] = lambda: None
 
 
 def carry_out(pdu: bytes, line: LineDiagnostics, server_id: bytes, exception_status: int) -> LineReply:
-    """Return the reply's body (all after the function code) to *pdu*, whose function is one of LINE_FUNCTIONS.
+    """Return the reply to *pdu*, whose function is one of LINE_FUNCTIONS.
 
     server_id: what function 17 tells after the run indicator; exception_status: the 8 outputs of function 7.
     raises:    RequestRefused(1): unknown sub-function, RequestRefused(3): wrong length or data.
     """
+    function = pdu[:1]
     if pdu[0] == 8:
         return _diagnose(pdu, line)
     if len(pdu) != 1:
         raise RequestRefused(ExceptionCode.ILLEGAL_DATA_VALUE)
     if pdu[0] == 7:
-        return LineReply(bytes([exception_status]))
+        return LineReply(function + bytes([exception_status]))
     if pdu[0] == 11:
-        return LineReply(_words(READY, line.events))
+        return LineReply(function + pack_words([READY, line.events]))
     if pdu[0] == 12:
         log = bytes(line.log)
-        return LineReply(bytes([6 + len(log)]) + _words(READY, line.events, line.bus_messages) + log)
-    return LineReply(bytes([len(server_id) + 1]) + server_id[:1] + bytes([RUNNING]) + server_id[1:])
+        counted = pack_words([READY, line.events, line.bus_messages])
+        return LineReply(function + bytes([len(counted) + len(log)]) + counted + log)
+    text = server_id[:1] + bytes([RUNNING]) + server_id[1:]
+    return LineReply(function + bytes([len(text)]) + text)
 
 
 def _diagnose(pdu: bytes, line: LineDiagnostics) -> LineReply:
@@ -149,17 +152,18 @@ def _diagnose(pdu: bytes, line: LineDiagnostics) -> LineReply:
     if sub == RETURN_QUERY_DATA:
         if not data or len(data) % 2:
             raise RequestRefused(ExceptionCode.ILLEGAL_DATA_VALUE)
-        return LineReply(pdu[1:])
+        return LineReply(pdu)
     value = word_at(data, 0)
     if len(data) != 2 or (value and not (sub == RESTART and value == CLEAR_LOG)):
         raise RequestRefused(ExceptionCode.ILLEGAL_DATA_VALUE)
     if sub == RESTART:
-        return LineReply(pdu[1:], silent=line.listen_only, then=lambda: _restart(line, value == CLEAR_LOG))
+        return LineReply(pdu, silent=line.listen_only, then=lambda: _restart(line, value == CLEAR_LOG))
     if sub == FORCE_LISTEN_ONLY:
         return LineReply(b"", silent=True, then=lambda: _listen_only(line))
     if sub == CLEAR:
-        return LineReply(pdu[1:], then=line.clear)
-    return LineReply(_words(sub, 0 if sub == RETURN_REGISTER else getattr(line, COUNTERS[sub])))
+        return LineReply(pdu, then=line.clear)
+    counted = 0 if sub == RETURN_REGISTER else getattr(line, COUNTERS[sub])
+    return LineReply(pdu[:1] + pack_words([sub, counted]))
 
 
 def _restart(line: LineDiagnostics, clear_log: bool) -> None:
@@ -174,7 +178,3 @@ def _restart(line: LineDiagnostics, clear_log: bool) -> None:
 def _listen_only(line: LineDiagnostics) -> None:
     line.listen_only = True
     line.log.appendleft(ENTERED_LISTEN_ONLY)
-
-
-def _words(*values: int) -> bytes:
-    return b"".join(value.to_bytes(2, "big") for value in values)

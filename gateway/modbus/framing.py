@@ -12,7 +12,7 @@ Source: Modbus over Serial Line V1.02 (sections 2.5.1 RTU, 2.5.2 ASCII) and Modb
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal, Protocol
 
@@ -26,6 +26,7 @@ ASCII_MAX: Final = 513  # section 2.5.2.1: colon, 2 x 255, CR LF
 TCP_HEADER: Final = 7  # transaction, protocol, length, unit
 TCP_LENGTH_MIN: Final = 2  # unit and function
 TCP_LENGTH_MAX: Final = 254  # unit and 253 bytes of PDU
+NOISE_MAX: Final = 2  # bytes that a turning RS-485 driver may put before a frame
 HELD_MAX: Final = 4096  # bytes kept of a stream that makes no sense
 
 
@@ -135,7 +136,8 @@ class RtuRequestFramer:
     Frames are found by length and confirmed by silence: nothing is decided before ``silence()`` was called. What
     has come by then is read from its start, frame by frame; the CRC tells a request from a reply where both have the
     same function. Where that does not come out even: the whole may be one frame (functions whose length only silence
-    tells, requests that are too long or too short), or its end may be one. A frame that is not whole yet is kept.
+    tells, requests that are too long or too short), or its end may be one. A frame that is not whole yet is kept,
+    unless a byte or two of noise only make it look so and the rest is a whole request.
     """
 
     def __init__(self) -> None:
@@ -175,10 +177,13 @@ class RtuRequestFramer:
         if rest and _is_frame(held, position):
             frames.append(_cut(held, position, len(held)))
             rest = 0
-        elif rest and self._is_lost(position):
-            self.damaged += 1
-            frames += self._last_frame(position)
-            rest = 0
+        elif rest:
+            is_lost = self._is_lost(position)
+            last = self._last_frame(position, len(held) if is_lost else position + NOISE_MAX)
+            if is_lost or last:
+                self.damaged += 1
+                frames += last
+                rest = 0
         del held[: len(held) - rest]
         self._frames += frames
 
@@ -205,14 +210,14 @@ class RtuRequestFramer:
             return False
         return all(stop <= len(self._held) for stop in self._ends(start))
 
-    def _last_frame(self, start: int) -> Iterator[Frame]:
-        """The request at the very end of what has come, after damage; else nothing."""
+    def _last_frame(self, start: int, latest: int) -> list[Frame]:
+        """The request at the very end of what has come, begun after *start* and not after *latest*; else nothing."""
         held = self._held
-        for first in range(max(start + 1, len(held) - RTU_MAX), len(held) - RTU_MIN + 1):
+        for first in range(max(start + 1, len(held) - RTU_MAX), min(latest, len(held) - RTU_MIN) + 1):
             length = pdu_length(REQUEST_SHAPES, held[first + 1 :])
             if length and first + 1 + length + 2 == len(held) and _is_frame(held, first):
-                yield _cut(held, first, len(held))
-                return
+                return [_cut(held, first, len(held))]
+        return []
 
 
 def _is_frame(data: bytearray, start: int) -> bool:

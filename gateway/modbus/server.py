@@ -1,7 +1,7 @@
 """What a slave (server) answers: one request in, one reply out, on a register.
 
 Pure but for the register: the whole behaviour of a slave can be tested with bytes alone, and the serial and the TCP
-driver share it. Units, frames and broadcasts are the driver's affair.
+driver share it. Units and frames are the driver's affair.
 
 Order of checks (spec section 3): function code (else exception 1), quantity and length (else 3), address range without
 wrap-around (else 2), value (else 3). A refused request changes nothing.
@@ -11,11 +11,14 @@ Source: MODBUS Application Protocol V1.1b3, sections 6 and 7.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from gateway.counters import ServeCounters
 from gateway.errors import QueueFull, RequestRefused
+from gateway.modbus.diagnostics import LINE_FUNCTIONS, LineDiagnostics, LineReply, carry_out
+from gateway.modbus.identification import Identity, read_device_identification
 from gateway.modbus.pdu import (
     TABLE_OF,
     ExceptionCode,
@@ -29,11 +32,16 @@ from gateway.modbus.pdu import (
     decode_request,
     encode_reply,
     exception_reply,
+    pack_words,
+    word_at,
 )
 from gateway.register import DataRegister, Source
 
-READING: Final = frozenset({1, 2, 3, 4})
+READING: Final = frozenset({1, 2, 3, 4, 24, 43})
 WRITING: Final = frozenset({5, 6, 15, 16, 22, 23})
+READ_FIFO: Final = 24
+IDENTIFY: Final = 43
+FIFO_MAX: Final = 31  # registers, section 6.18
 
 
 @dataclass
@@ -44,6 +52,9 @@ class Server:
     functions: what is answered; empty: everything.
     first, count: the window of points served in each table; count 0: to the end of the table.
     stale:     "exception" answers 0x0B instead of a polled point that is bad, stale or never read.
+    line:      the serial line's counters and log; None on Modbus TCP, where functions 7, 8, 11, 12 and 17 are unknown.
+    exception_status: the 8 outputs of function 7.
+    read_fifo: gives the registers of the queue at an address, at most 31, or None where there is no queue.
     """
 
     register: DataRegister
@@ -54,38 +65,77 @@ class Server:
     first: int = 0
     count: int = 0
     counters: ServeCounters = field(default_factory=ServeCounters)
+    identity: Identity = field(default_factory=Identity)
+    line: LineDiagnostics | None = None
+    exception_status: Callable[[], int] = lambda: 0
+    read_fifo: Callable[[int], list[int] | None] = lambda address: None  # noqa: ARG005 - there is no queue anywhere
 
     def serves(self, function: int) -> bool:
         """Return whether *function* is answered at all."""
         if function in WRITING and not self.writable:
             return False
-        return function in READING | WRITING and (not self.functions or function in self.functions)
+        if function in LINE_FUNCTIONS and self.line is None:
+            return False
+        return function in READING | WRITING | LINE_FUNCTIONS and (not self.functions or function in self.functions)
 
 
-def answer(request: bytes, server: Server) -> bytes:
+def answer(request: bytes, server: Server, broadcast: bool = False) -> bytes:
     """Return the reply to *request*.
 
-    request: a PDU, function code and body, 1 to 253 bytes.
-    returns: a PDU: the reply, or an exception reply (section 7).
+    request:   a PDU, function code and body, 1 to 253 bytes.
+    broadcast: it was for everybody: the caller throws the reply away, and the line counts it as unanswered.
+    returns:   a PDU: the reply, or an exception reply (section 7); b"" where the line listens only (section 6.8).
     """
     server.counters.requests += 1
+    line, function = server.line, request[0] if request else 0
+    if line is not None:
+        line.received(broadcast)
+    outcome, code = LineReply(b""), 0
     try:
-        reply = _reply(request, server)
+        if line is not None and line.listen_only and request[:3] != b"\x08\x00\x01":
+            outcome = LineReply(b"", silent=True)  # only a restart is carried out
+        else:
+            outcome = _outcome(request, server)
     except RequestRefused as refused:
-        server.counters.exceptions[refused.code] += 1
-        return exception_reply(request[0] if request else 0, refused.code)
-    server.counters.good += 1
-    return reply
+        code = refused.code
+        outcome = LineReply(exception_reply(function, code), silent=line is not None and line.listen_only)
+        server.counters.exceptions[code] += 1
+    else:
+        server.counters.good += 1
+    if line is not None:
+        line.carried_out(function, code, answered=not (outcome.silent or broadcast))
+    outcome.then()
+    return b"" if outcome.silent else outcome.reply
 
 
-def _reply(pdu: bytes, server: Server) -> bytes:
-    if not pdu or not server.serves(pdu[0]):
+def _outcome(request: bytes, server: Server) -> LineReply:
+    """Return the whole reply to a request that is not refused."""
+    if not request or not server.serves(request[0]):
         raise RequestRefused(ExceptionCode.ILLEGAL_FUNCTION)
-    request = decode_request(pdu)
+    function = request[0]
+    if server.line is not None and function in LINE_FUNCTIONS:
+        return carry_out(request, server.line, server.identity.server_id, server.exception_status())
+    if function == IDENTIFY:
+        return LineReply(read_device_identification(request, server.identity))
+    if function == READ_FIFO:
+        return LineReply(_read_fifo(request, server))
     try:
-        return encode_reply(request, _carry_out(request, server))
+        decoded = decode_request(request)
+        return LineReply(encode_reply(decoded, _carry_out(decoded, server)))
     except QueueFull:
         raise RequestRefused(ExceptionCode.SERVER_DEVICE_BUSY) from None
+
+
+def _read_fifo(request: bytes, server: Server) -> bytes:
+    """Function 24, section 6.18: byte count, register count, registers."""
+    if len(request) != 3:
+        raise RequestRefused(ExceptionCode.ILLEGAL_DATA_VALUE)
+    registers = server.read_fifo(word_at(request[1:], 0))
+    if registers is None:
+        raise RequestRefused(ExceptionCode.ILLEGAL_DATA_ADDRESS)
+    if len(registers) > FIFO_MAX:
+        raise RequestRefused(ExceptionCode.ILLEGAL_DATA_VALUE)
+    return bytes([READ_FIFO]) + pack_words([2 + 2 * len(registers), len(registers), *registers])
 
 
 def _carry_out(request: Request, server: Server) -> bytes:

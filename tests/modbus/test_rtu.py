@@ -498,3 +498,16 @@ def test_a_start_that_promises_more_than_256_bytes_is_given_up_at_once() -> None
     longest = with_crc("02 04 FB" + " 5A" * 251)
     assert len(longest) == 256
     assert answered([longest], awaiting()) == [frame_of(longest)]
+
+
+@pytest.mark.parametrize("noise", [b"\x00", b"\xff", b"\x00\x00", b"\xff\x00"])
+@pytest.mark.parametrize("unit", [1, 3, 6, 15, 16, 17, 22, 23])
+def test_noise_of_a_turning_driver_makes_no_slave_deaf(noise: bytes, unit: int) -> None:
+    """With the noise as a unit and our unit as a function, it looks like the start of a longer frame."""
+    for pdu in (bytes.fromhex("03 0000 0001"), bytes.fromhex("06 0001 0003"), bytes.fromhex("10 0001 0001 02 000A")):
+        framer = RtuRequestFramer()
+        framer.receive_data(noise + encode_rtu(Frame(unit, pdu)))
+        framer.silence()
+        frames = drain(framer)
+        assert frames[-1] == Frame(unit, pdu)
+        assert framer.pending == 0
