@@ -37,9 +37,10 @@ def serve_rtugate(port: int) -> None:
     """Run our slave with nothing else."""
     from gateway.clock import SystemClock
     from gateway.config import SlaveConfig
-    from gateway.link import Waker, listen_tcp
+    from gateway.link import Waker
+    from gateway.link_tcp import listen_tcp
     from gateway.register import DataRegister
-    from gateway.slave import TcpSlave
+    from gateway.slave_tcp import TcpSlave
 
     clock = SystemClock()
     config = SlaveConfig(name="bench", line=f"tcp://127.0.0.1:{port}", unit=1)

@@ -32,10 +32,10 @@ class Backoff:
         return max(0.0, self._due_s - self._clock.monotonic())
 
     def failed(self, reason: str) -> bool:
-        """Say so once, and wait longer each time. Returns True if *reason* is news."""
-        is_news = reason != self.trouble
-        if is_news:
-            log.error("%s: %s; trying again", self._name, reason)
+        """Say so once, and wait longer each time. Returns True the first time since the line worked."""
+        is_news = not self.trouble
+        level = logging.ERROR if is_news else logging.DEBUG
+        log.log(level, "%s: %s; trying again", self._name, reason)
         self.trouble = reason
         self._due_s = self._clock.monotonic() + self._after_s
         self._after_s = min(MOST_S, 2 * self._after_s)

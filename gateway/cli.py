@@ -1,11 +1,14 @@
 """The `rtugate` command (spec section 9).
 
-Exit codes: 0 done, 1 the answer is no, 2 wrong usage. Errors go to stderr, a line each, never a traceback.
+Exit codes: 0 done, 1 the answer is no, 2 wrong usage. Errors go to stderr, a line each, never a traceback. A file that is
+not there is wrong usage; one that is there and cannot be used is an answer: `check` says no, `run` goes on without it.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import logging
 import os
 import signal
@@ -13,14 +16,15 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 from gateway import __version__
 from gateway.clock import SystemClock
 from gateway.config import Config, MasterConfig
+from gateway.config_fields import escaped
 from gateway.errors import ConfigError
 from gateway.line_load import line_load
-from gateway.store import Loaded, load
+from gateway.store import NAME_CHARACTERS, Loaded, load
 from gateway.supervisor import Supervisor
 from gateway.wiring import build
 
@@ -35,25 +39,42 @@ log = logging.getLogger("gateway")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
-    parsed = _parser().parse_args(arguments)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a terminal that does not know a letter is no error
     try:
-        return int(parsed.command(parsed))
+        return _run_command(arguments)
     except BrokenPipeError:  # the reader of our output has gone: `rtugate check | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        _silence(sys.stdout)
+    except OSError as error:  # a full disk behind our output
+        _silence(sys.stdout)
+        with contextlib.suppress(OSError):
+            print(f"rtugate: the output cannot be written: {error.strerror or error}", file=sys.stderr)
+    return 1
+
+
+def _run_command(arguments: Sequence[str] | None) -> int:
+    try:
+        parsed = _parser().parse_args(arguments)
+        return int(parsed.command(parsed))
+    finally:
+        if sys.stdout is not None:  # it is None when started with it closed
+            sys.stdout.flush()  # what cannot be written is told by us, not by the interpreter at its end
+
+
+def _silence(stream: TextIO) -> None:
+    """Send what still waits in *stream* nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("-c", metavar="FILE", dest="config", default=CONFIG_DEFAULT, help="default: %(default)s")
-    common.add_argument(
-        "--state",
-        metavar="DIR",
-        default=os.environ.get("STATE_DIRECTORY", STATE_DEFAULT),
-        help="state directory, not used yet; default: $STATE_DIRECTORY, else " + STATE_DEFAULT,
-    )
+    state = os.environ.get("STATE_DIRECTORY", STATE_DEFAULT)
+    common = _common_options(
+        argparse.SUPPRESS, argparse.SUPPRESS
+    )  # behind the command: no default overrides the others
     parser = argparse.ArgumentParser(
-        prog="rtugate", description="Modbus gateway: polls field devices, serves their data to SCADA."
+        prog="rtugate",
+        description="Modbus gateway: polls field devices, serves their data to SCADA.",
+        parents=[_common_options(CONFIG_DEFAULT, state)],
     )
     parser.add_argument("--version", action="version", version=f"rtugate {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
@@ -70,6 +91,19 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--silent", choices=["meter", "boiler", "io"], help="a device that does not answer")
     demo.set_defaults(command=_demo)
     return parser
+
+
+def _common_options(config: str, state: str) -> argparse.ArgumentParser:
+    """What belongs to every command, before or behind it, with these defaults; the last one counts."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument("-c", metavar="FILE", dest="config", default=config, help=f"default: {CONFIG_DEFAULT}")
+    options.add_argument(
+        "--state",
+        metavar="DIR",
+        default=state,
+        help=f"state directory, not used yet; default: $STATE_DIRECTORY, else {STATE_DEFAULT}",
+    )
+    return options
 
 
 def _positive(text: str) -> float:
@@ -91,8 +125,8 @@ def _port(text: str) -> int:
 
 def _run(parsed: argparse.Namespace) -> int:
     path = Path(parsed.config)
-    if not path.exists():
-        return _usage(f"{path}: no such file")
+    if _is_missing(path):
+        return _no_such_file(path)
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # one that comes early waits until it can be heeded
     logging.basicConfig(format="%(levelname)s %(message)s", stream=sys.stderr)
     config = _usable(path)
@@ -114,7 +148,7 @@ def _usable(path: Path) -> Config:
     except ConfigError as error:
         for finding in error.findings:
             log.error("%s", finding)
-        log.error("%s cannot be used: running with factory settings, no line is polled or served", path)
+        log.error("%s cannot be used: running with factory settings, no line is polled or served", _shown(path))
         return Config()
     for finding in loaded.findings:
         log.log(logging.INFO if finding.severity == "note" else logging.WARNING, "%s", finding)
@@ -132,16 +166,16 @@ def _stop_on_signals(stop: Callable[[], None]) -> None:
 
 
 def _check(parsed: argparse.Namespace) -> int:
-    path = Path(parsed.file or parsed.config)
-    if not path.exists():
-        return _usage(f"{path}: no such file")
+    path = Path(parsed.config if parsed.file is None else parsed.file)
+    if _is_missing(path):
+        return _no_such_file(path)
     try:
         loaded = load(path)
     except ConfigError as error:
         for finding in error.findings:
             print(finding, file=sys.stderr)
         return 1
-    print(f"{path}: valid")
+    print(f"{_shown(path)}: valid")
     _print_loads(loaded)
     return 0
 
@@ -172,6 +206,24 @@ def _demo(parsed: argparse.Namespace) -> int:
     return run_demo(parsed.seconds, parsed.port, parsed.silent, sys.stdout, stop)
 
 
-def _usage(message: str) -> int:
-    print(f"rtugate: {message}", file=sys.stderr)
+# ------------------------------------------------------------------------------------------------ files
+
+
+def _is_missing(path: Path) -> bool:
+    """Whether nothing is there; what is there, or may be, is for ``load`` to judge."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: no file can be called that
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _no_such_file(path: Path) -> int:
+    print(f"rtugate: {_shown(path)}: no such file", file=sys.stderr)
     return 2
+
+
+def _shown(path: Path) -> str:
+    return escaped(str(path), NAME_CHARACTERS)

@@ -19,7 +19,7 @@ from typing import Final
 from gateway.clock import Clock
 from gateway.errors import QueueFull
 from gateway.modbus.pdu import Span
-from gateway.register import CommandSink, DataRegister, Quality, Source, runs
+from gateway.register import NEVER_S, CommandSink, DataRegister, Quality, Source, runs
 
 QUEUE_LIMIT: Final = 100  # commands of one master that wait
 
@@ -30,8 +30,8 @@ class Outlet:
 
     on_change:      each write makes a command; False: the request is sent by cycle and only holds its points.
     whole:          a command carries all of *span*, not only what was written.
-    commanded_only: a cyclic request sends only what the upper side or a person wrote, because the same device fills
-                    these points, too, and its own values are not sent back to it.
+    commanded_only: a cyclic request is sent only once the upper side or a person wrote one of its points, because the
+                    same device fills them, too, and what it said is not sent back to it for nothing.
     expire_s:       a command not delivered for so long is dropped; 0: never.
     """
 
@@ -42,6 +42,7 @@ class Outlet:
     commanded_only: bool = False
     expire_s: float = 10.0
     pending: dict[int, int] = field(default_factory=dict)  # point: number of its newest undelivered write
+    dropped: set[int] = field(default_factory=set)  # points whose last write was given up
 
 
 @dataclass(frozen=True)
@@ -108,8 +109,14 @@ class CommandQueue(CommandSink):
         needed = sum(outlet.on_change for outlet in self._outlets if outlet.span.overlaps(span))
         if len(self._queue) + needed > self._limit:
             self._queue = deque(command for command in self._queue if command.newest_points)
-        if len(self._queue) + needed > self._limit:
+        kept = [command for command in self._queue if not self._is_replaced(command, span)]
+        if len(kept) + needed > self._limit:
             raise QueueFull(f"{self._limit} commands wait for this line already")
+
+    @staticmethod
+    def _is_replaced(command: Command, span: Span) -> bool:
+        """True if a write to *span* takes over all that *command* still has to carry."""
+        return command.span.table is span.table and set(command.newest_points) <= set(range(span.start, span.stop))
 
     def accept(self, span: Span, number: int) -> None:
         self._number = number
@@ -228,8 +235,26 @@ class CommandQueue(CommandSink):
             return None if data is None else (data, self._number)
 
     def delivered(self, outlet: Outlet, number: int) -> None:
-        """The device has answered a cyclic request that carried everything up to *number*."""
+        """The device has taken a cyclic request that carried everything up to *number*."""
         self._settle(outlet, outlet.span, number, is_delivered=True)
+
+    def refused(self, outlet: Outlet, number: int) -> None:
+        """The device has refused a cyclic request that carried everything up to *number*."""
+        self._settle(outlet, outlet.span, number, is_delivered=False)
+
+    def restore(self, outlet: Outlet) -> None:
+        """The device is back: what it took before it fell silent is good again, unless a request reads it."""
+        with self._register.lock:
+            points = self._register.points_locked(outlet.span.table)
+            for point in self._register.unfilled_locked(points, outlet.span):
+                is_taken = point not in outlet.pending and point not in outlet.dropped
+                if is_taken and points.quality[point] == Quality.BAD:
+                    points.quality[point] = Quality.GOOD if points.time_s[point] > NEVER_S else Quality.NEVER
+
+    def waiting(self) -> set[Outlet]:
+        """Return the outlets that have commands in the queue."""
+        with self._register.lock:
+            return {command.outlet for command in self._queue}
 
     def _settle(self, outlet: Outlet, span: Span, number: int, is_delivered: bool) -> None:
         """Let go of the points of *span* that no write later than *number* holds."""
@@ -242,7 +267,9 @@ class CommandQueue(CommandSink):
         """Points not delivered are bad; delivered ones are no longer, if their device was offline meanwhile."""
         quality = self._register.points_locked(outlet.span.table).quality
         for point in points:
+            outlet.dropped.discard(point)
             if not is_delivered:
+                outlet.dropped.add(point)
                 quality[point] = Quality.BAD
             elif quality[point] == Quality.BAD:
                 quality[point] = Quality.GOOD

@@ -10,7 +10,7 @@ Source: specification of rtugate, section 6; reference.toml for the limits.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from ipaddress import ip_address, ip_interface, ip_network
@@ -189,9 +189,9 @@ def shown(value: object) -> str:
     return str(value)
 
 
-def escaped(text: str) -> str:
-    """*text* without control characters, cut where it gets long."""
-    cut = text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}..."
+def escaped(text: str, most: int = SHOWN_CHARACTERS) -> str:
+    """*text* without control characters, cut behind *most* characters."""
+    cut = text if len(text) <= most else f"{text[:most]}..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
 
 
@@ -199,6 +199,49 @@ def explain(error: ValidationError, model: type[BaseModel]) -> list[Finding]:
     """Every error of *model*'s validation as a finding, in words of our own."""
     details = error.errors(include_url=False)
     return [_explain(detail, model, with_hint=n < HINTS) for n, detail in enumerate(details)]
+
+
+class Known:
+    """Says whether a key has a value to rely on; *doubtful* are the paths that have none, with all that is in them."""
+
+    def __init__(self, doubtful: Iterable[Path] = ()) -> None:
+        self._doubtful = frozenset(doubtful)
+
+    def __call__(self, path: Path, *keys: str) -> bool:
+        """Whether all *keys* of the table or entry at *path* can be relied on."""
+        if not self._doubtful:
+            return True
+        around = [path[:length] for length in range(len(path) + 1)]
+        return self._doubtful.isdisjoint(around) and self._doubtful.isdisjoint([(*path, key) for key in keys])
+
+
+def doubtful(error: ValidationError, model: type[BaseModel], data: Mapping[str, Any]) -> Iterator[Path]:
+    """The paths in *data* that have no value to rely on while *error* stands.
+
+    A wrong item of a list spoils the whole key. An unknown key spoils what it may have been meant for.
+    """
+    for n, detail in enumerate(error.errors(include_url=False)):
+        path = detail["loc"]
+        if isinstance(path[-1], int) and detail["type"] != "model_type":
+            path = path[:-1]
+        yield path
+        if detail["type"] == "extra_forbidden":
+            yield from _meant(path, model, data) if n < HINTS else [path[:-1]]
+
+
+def _meant(path: Path, root: type[BaseModel], data: Mapping[str, Any]) -> Iterator[Path]:
+    """A key with nearly that name, else any that is not written; or the same key, meant for another table."""
+    *outer, key = path
+    written: Any = data
+    for part in outer:
+        written = written[part]
+    known = _keys(_model_at(root, path))
+    for meant in _close_to(str(key), known) or [name for name in known if name not in written]:
+        yield (*outer, meant)
+    for length in range(len(outer)):
+        yield (*outer[:length], key)
+    if not outer:
+        yield from ((table, key) for table in known)
 
 
 def _explain(detail: ErrorDetails, root: type[BaseModel], with_hint: bool) -> Finding:
@@ -220,8 +263,13 @@ def _explain(detail: ErrorDetails, root: type[BaseModel], with_hint: bool) -> Fi
 
 
 def _unknown(key: str, known: Iterable[str]) -> str:
-    close = get_close_matches(key, known, n=1) if len(key) < SHOWN_CHARACTERS else []
+    close = _close_to(key, known)
     return f'unknown key "{escaped(key)}"' + (f'; did you mean "{close[0]}"?' if close else "")
+
+
+def _close_to(key: str, known: Iterable[str]) -> list[str]:
+    """The one of *known* that *key* is likely to mean, if any."""
+    return get_close_matches(key, known, n=1) if len(key) < SHOWN_CHARACTERS else []
 
 
 def _header(path: Path) -> str:

@@ -25,7 +25,7 @@ from pymodbus.exceptions import ModbusException
 from gateway.clock import SystemClock
 from gateway.config import Config
 from gateway.errors import LinkUnavailable
-from gateway.link import listen_tcp
+from gateway.link_tcp import listen_tcp
 from gateway.modbus.pdu import Span, Table
 from gateway.register import DataRegister, Quality
 from gateway.simulator import Device, Simulator, demo_devices

@@ -3,7 +3,8 @@
     GatewayError
     ├── ConfigError             the configuration cannot be used; carries every finding
     ├── RequestInvalid          a request that must not be sent or stored: caller's mistake
-    │   └── PointsOutOfRange    points that the register does not have
+    │   ├── PointsOutOfRange    points that the register does not have
+    │   └── PointUnknown        part of a point is to be sent whose value nobody knows
     ├── RequestRefused          a request that came to us is answered with an exception code
     ├── QueueFull               a command queue has no room: the write is refused whole
     ├── DeviceRefused           the device answered with an exception code
@@ -39,6 +40,10 @@ class RequestInvalid(GatewayError, ValueError):
 
 class PointsOutOfRange(RequestInvalid):
     """Points that the register's table does not have."""
+
+
+class PointUnknown(RequestInvalid):
+    """Part of a point is to be changed and sent to a device, and nobody knows the rest of its value."""
 
 
 class RequestRefused(GatewayError):

@@ -127,14 +127,14 @@ class EventQueue:
         table, value_at = written.span.table, bit_at if written.span.table.is_bits else word_at
         when_ms = int(self._clock.wall() * 1000)
         with self._lock:
-            before = len(self._changes)
+            before = len(self._changes), self._lost
             for point in range(start, stop):
                 value = int(value_at(written.data, point - written.span.start))
                 old = self._known.get((table, point))
                 self._known[table, point] = value
                 if old is not None and old != value:
                     self._add(table, point, value, when_ms)
-            is_news = len(self._changes) != before or self._lost
+            is_news = (len(self._changes), self._lost) != before
         if is_news:
             self._show()
 

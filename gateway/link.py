@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
 import itertools
 import math
 import os
@@ -49,14 +48,6 @@ _PORT_REASONS = {
     **dict.fromkeys((errno.ENOTTY, errno.EISDIR), "is no serial port"),
     errno.EIO: "no serial hardware answers there",
 }
-_TCP_OPTIONS = {socket.TCP_NODELAY: 1, socket.TCP_USER_TIMEOUT: 30_000}  # ms
-_TCP_OPTIONS |= {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}  # s, s, probes
-_LISTEN_REASONS = {
-    errno.EACCES: "permission denied (ports below 1024 need CAP_NET_BIND_SERVICE, which the service has)",
-    errno.EADDRNOTAVAIL: "this machine does not have this address",
-}
-
-_Address = tuple[socket.AddressFamily, socket.SocketKind, int, str, tuple[str | int | bytes, ...]]
 
 
 def silence_s(baudrate: int, character_s: float) -> float:
@@ -64,7 +55,7 @@ def silence_s(baudrate: int, character_s: float) -> float:
     return 0.00175 if baudrate > 19200 else 3.5 * character_s
 
 
-def _wait(reading: Sequence[int], writing: Sequence[int], timeout_s: float | None) -> list[int]:
+def wait_ready(reading: Sequence[int], writing: Sequence[int], timeout_s: float | None) -> list[int]:
     """Return the descriptors that are ready, as soon as one is; [] after the timeout (None: no limit).
 
     ``select`` keeps microseconds. From descriptor 1024 on only ``poll`` is left, which rounds up to milliseconds.
@@ -89,6 +80,12 @@ class Waker:
     def __init__(self) -> None:
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._lock = threading.RLock()
+        self.ended = False  # True: every wait ends at once, for good
+
+    def end(self) -> None:
+        """End the present wait and all that follow: the thread that waits is to stop. From any thread."""
+        self.ended = True
+        self.wake()
 
     def wake(self) -> None:
         """End the present wait, or the next one; from any thread; does nothing once closed."""
@@ -101,13 +98,15 @@ class Waker:
         return self._fd
 
     def clear(self) -> None:
-        """Forget all wakes so far."""
+        """Forget all wakes so far, but not an ``end``."""
+        if self.ended:
+            return
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._fd)
 
     def wait(self, timeout_s: float | None) -> bool:
         """True when woken, which is then cleared; False after *timeout_s* (None: no limit)."""
-        woken = bool(_wait((self._fd,), (), timeout_s))
+        woken = bool(wait_ready((self._fd,), (), timeout_s))
         if woken:
             self.clear()
         return woken
@@ -151,7 +150,7 @@ class DescriptorLink:
     clock: Clock
     hangup: str  # what an end of file means to a person
     character_s: float = 0.0
-    write_grace_s: float = 2.0  # beyond the time of the characters themselves
+    write_grace_s: float = 1.0  # beyond the time of the characters themselves
 
     def __post_init__(self) -> None:
         self._fd = self.port.fileno()
@@ -160,7 +159,7 @@ class DescriptorLink:
         """Bytes go before a wake, which then ends the next read."""
         if self._fd < 0:
             raise LinkLost(f"{self.name}: is closed")
-        ready = _wait((self._fd, self.waker.fileno()), (), timeout_s)
+        ready = wait_ready((self._fd, self.waker.fileno()), (), timeout_s)
         if self._fd in ready:
             return self._take()
         if ready:
@@ -176,7 +175,7 @@ class DescriptorLink:
                 rest = rest[os.write(self._fd, rest) :]
             except BlockingIOError:
                 remaining_s = deadline - self.clock.monotonic()
-                if remaining_s <= 0 or not _wait((), (self._fd,), remaining_s):
+                if remaining_s <= 0 or not wait_ready((), (self._fd,), remaining_s):
                     raise LinkLost(f"{self.name}: does not take data") from None
             except OSError as error:
                 raise self._lost(error) from error
@@ -207,7 +206,7 @@ class DescriptorLink:
         return data
 
     def _lost(self, error: BaseException) -> LinkLost:
-        return LinkLost(f"{self.name}: {_plain(error, {})}")
+        return LinkLost(f"{self.name}: {plain_reason(error, {})}")
 
 
 @dataclass(eq=False, kw_only=True)
@@ -223,12 +222,12 @@ class RtsLink(DescriptorLink):
         try:
             self.switch(True)
             try:
-                _wait((), (), self.before_s)
+                wait_ready((), (), self.before_s)
                 ends_at = self.clock.monotonic() + len(data) * self.character_s
                 super().write(data)
                 with contextlib.suppress(termios.error):  # a signal; or a lost port, which shows below
                     termios.tcdrain(self._fd)
-                _wait((), (), ends_at - self.clock.monotonic() + self.after_s)
+                wait_ready((), (), ends_at - self.clock.monotonic() + self.after_s)
             finally:
                 self.switch(False)
         except OSError as error:
@@ -327,7 +326,7 @@ def open_serial(settings: SerialSettings, waker: Waker, clock: Clock) -> Link:
         raise
     except (OSError, termios.error, ValueError) as error:  # all that pyserial lets out
         port.close()
-        raise LinkUnavailable(f"{settings.device}: {_plain(error, _PORT_REASONS)}") from error
+        raise LinkUnavailable(f"{settings.device}: {plain_reason(error, _PORT_REASONS)}") from error
     shared = (settings.device, port, waker, clock, "is gone (unplugged?)", settings.character_s)
     link = DescriptorLink(*shared)
     if settings.rs485 == "rts":
@@ -385,113 +384,7 @@ def _code(error: BaseException | None) -> int:
     return error.errno or _code(error.__context__) if isinstance(error, OSError) else 0
 
 
-def _plain(error: BaseException, reasons: Mapping[int, str]) -> str:
+def plain_reason(error: BaseException, reasons: Mapping[int, str]) -> str:
     """The reason alone, without number and path: from *reasons*, else as the system words it."""
     code = _code(error)
     return reasons.get(code) or (os.strerror(code).lower() if code else str(error))
-
-
-def set_tcp_options(connection: socket.socket) -> None:
-    """Make a connection, ours or accepted, non-blocking, prompt, and sure to notice a dead peer in a minute."""
-    connection.setblocking(False)
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in _TCP_OPTIONS.items():
-        connection.setsockopt(socket.IPPROTO_TCP, option, value)
-
-
-def connect_tcp(host: str, port: int, waker: Waker, clock: Clock, timeout_s: float) -> Link:
-    """Connect to a device; every address of a name gets its share of *timeout_s*.
-
-    raises: LinkUnavailable: refused, no answer in time, name not known, or interrupted by the waker (then cleared).
-    """
-    name = _tcp_name(host, port)
-    deadline = clock.monotonic() + timeout_s
-    addresses = _addresses(name, host, port, waker, timeout_s)
-    reasons, reason = {errno.ETIMEDOUT: f"no answer within {timeout_s:g} s"}, ""
-    for tried, address in enumerate(addresses):
-        share_s = (deadline - clock.monotonic()) / (len(addresses) - tried)
-        try:
-            connection = _connect(name, address, waker, share_s)
-        except OSError as error:
-            reason = _plain(error, reasons)
-        else:
-            return DescriptorLink(name, connection, waker, clock, "closed by the other side")
-    raise LinkUnavailable(f"{name}: {reason}")
-
-
-def _connect(name: str, address: _Address, waker: Waker, timeout_s: float) -> socket.socket:
-    """One attempt; OSError says why it failed, ETIMEDOUT that nobody answered."""
-    family, *_, where = address
-    connection = socket.socket(family, socket.SOCK_STREAM)
-    try:
-        set_tcp_options(connection)
-        code = connection.connect_ex(where)
-        if code == errno.EINPROGRESS:
-            ready = _wait((waker.fileno(),), (connection.fileno(),), timeout_s)
-            _stop_if_woken(name, ready, waker)
-            code = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) if ready else errno.ETIMEDOUT
-        if code:
-            raise OSError(code, os.strerror(code))
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def _stop_if_woken(name: str, ready: list[int], waker: Waker) -> None:
-    if waker.fileno() in ready:
-        waker.clear()
-        raise LinkUnavailable(f"{name}: interrupted")
-
-
-def listen_tcp(host: str, port: int) -> socket.socket:
-    """Return a non-blocking listening socket; port 0 lets the system choose one; "::" is IPv6 alone,
-    so that clients' addresses stay plain for lists of networks.
-
-    raises: LinkUnavailable: in use, no permission, not an address of this machine.
-    """
-    name = _tcp_name(host, port)
-    with contextlib.closing(Waker()) as never_woken:
-        family, *_, where = _addresses(name, host, port, never_woken, timeout_s=5.0)[0]
-    try:
-        listener = socket.create_server(where, family=family, backlog=128)  # SO_REUSEADDR, IPV6_V6ONLY
-    except OSError as error:
-        raise LinkUnavailable(f"{name}: {_plain(error, _LISTEN_REASONS)}") from error
-    listener.setblocking(False)
-    return listener
-
-
-def _tcp_name(host: str, port: int) -> str:
-    return f"tcp [{host}]:{port}" if ":" in host else f"tcp {host}:{port}"
-
-
-def _addresses(name: str, host: str, port: int, waker: Waker, timeout_s: float) -> Sequence[_Address]:
-    """All addresses of *host*: at once if it is written in digits, else from the resolver.
-
-    The resolver is asked in a thread of its own, so that it delays neither the timeout nor a stop. That thread owns
-    one end of a pipe and says "done" by closing it: it never touches a descriptor of ours.
-    """
-    resolve = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
-    with contextlib.suppress(OSError, ValueError):  # ValueError: it cannot even be a name
-        return resolve(flags=socket.AI_NUMERICHOST)
-    found: list[_Address] = []
-    done, asking = os.pipe()
-
-    def ask() -> None:
-        try:
-            with contextlib.suppress(OSError, ValueError):
-                found.extend(resolve())
-        finally:
-            os.close(asking)
-
-    threading.Thread(target=ask, name="resolver", daemon=True).start()
-    try:
-        ready = _wait((done, waker.fileno()), (), timeout_s)
-    finally:
-        os.close(done)
-    _stop_if_woken(name, ready, waker)
-    if not ready:
-        raise LinkUnavailable(f"{name}: no name server answers within {timeout_s:g} s")
-    if not found:
-        raise LinkUnavailable(f"{name}: name is not known, or its name server does not answer")
-    return found

@@ -14,7 +14,6 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.backoff import Backoff
@@ -23,12 +22,22 @@ from gateway.commands import Command, CommandQueue
 from gateway.config import MasterConfig
 from gateway.counters import PollCounters
 from gateway.errors import LinkError, QueueFull
-from gateway.link import Link, Waker, silence_s
+from gateway.link import Link, Waker
 from gateway.modbus.pdu import Request
-from gateway.polls import OFFLINE_AFTER, Device, Poll, ProbeBudget, count_response, polls_of, status_span
-from gateway.register import DataRegister, Quality
+from gateway.polls import (
+    OFFLINE_AFTER,
+    Device,
+    Poll,
+    ProbeBudget,
+    Ticket,
+    count_response,
+    polls_of,
+    status_span,
+    timing_of,
+)
+from gateway.register import DataRegister
 from gateway.schedule import Schedule
-from gateway.transaction import DAMAGED, TIMEOUT, Line, Response, Timing, check_asked
+from gateway.transaction import DAMAGED, TIMEOUT, Line, Response, check_asked
 
 COMMANDS_IN_A_ROW: Final = 4  # then one poll goes through
 SUBMIT_LIMIT: Final = 16  # commands from the menu that wait
@@ -38,17 +47,6 @@ PROBE_LEAST_S: Final = 0.1  # a probe that found nothing to send is not tried ag
 STATUS_EVERY_S: Final = 1.0
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(eq=False)
-class Ticket:
-    """A command from the menu, and later its response: None if it was never sent or the line was lost."""
-
-    unit: int
-    request: Request
-    made_s: float
-    response: Response | None = None
-    done: threading.Event = field(default_factory=threading.Event)
 
 
 class Master:
@@ -83,6 +81,8 @@ class Master:
         self._has_answered = False  # since the line was opened
         self._is_resting = False  # a connection that worked and was closed: opened again when there is work for it
         scheduled = [poll for poll in self.polls if poll.is_scheduled]
+        self._scheduled = len(scheduled)
+        self._busy_since_s: float | None = None  # since when the line has not been silent
         self._schedule = Schedule([poll.config.every for poll in scheduled])
         self._online = (1 << len(scheduled)) - 1
         self._offline: set[Device] = set()
@@ -106,6 +106,11 @@ class Master:
     def trouble(self) -> str:
         """Why the line cannot be used, for people; "" while it can."""
         return self._opening.trouble
+
+    @property
+    def has_alarm(self) -> bool:
+        """True while the line cannot be used, or one of its devices is offline."""
+        return bool(self._opening.trouble or self._offline)
 
     # -------------------------------------------------------------------------------------------- from any thread
 
@@ -174,14 +179,28 @@ class Master:
                 self._work(self._line)
             except LinkError as error:
                 self._broke(str(error))
+            else:
+                if self._line is not None and not self.config.is_tcp and self._opening.trouble:
+                    self._opening.worked()  # a port has to carry something first; a connection, an answer
 
     def _work(self, line: Line) -> None:
         if self.config.is_tcp and self._silent_in_row >= SILENT_TCP_LIMIT:
             self._renew("nothing answers")
             return
+        if not line.is_free or (line.silent_in_s() and not self._is_never_silent()):
+            line.advance(min(line.silent_in_s() or self._wait_limit_s, self._wait_limit_s))
+            return  # nothing is taken before it can be sent at once: a newer value may come meanwhile
+        self._busy_since_s = None
         if self._carry_out_command(line) or self._carry_out_probe(line) or self._carry_out_poll(line):
             return
         line.advance(self._wait_s())
+
+    def _is_never_silent(self) -> bool:
+        """True when the line has babbled for a whole response timeout: polls then fail, and say so."""
+        now_s = self._clock.monotonic()
+        if self._busy_since_s is None:
+            self._busy_since_s = now_s
+        return now_s - self._busy_since_s >= self.config.response_timeout + self.config.delay
 
     def _wait_s(self) -> float:
         """How long nothing is due."""
@@ -205,31 +224,22 @@ class Master:
         try:
             self._link = self._open_link()
         except LinkError as error:
-            self._lost(str(error))
+            if not self._waker.ended:
+                self._lost(str(error))
             return
         finally:
             self.ready.set()
         log.debug("%s: polling on %s", self.name, self.config.line)
-        self._line = Line(self._link, self.config.framing_used, self._timing(self._link), self._clock)
+        self._line = Line(
+            self._link, self.config.framing_used, timing_of(self.config, self._link.character_s), self._clock
+        )
         self._silent_in_row = 0
         self._has_answered = self._is_resting = False
-        if not self.config.is_tcp:  # a connection has to prove itself by an answer
-            self._opening.worked()
+        self._schedule.at_once((1 << self._scheduled) - 1)  # what was missed meanwhile is no overrun
 
     def _is_work_due(self) -> bool:
         is_probe_due = bool(self._offline) and self._clock.monotonic() >= self._probes.due_s()
         return bool(self._submitted) or len(self._queue) > 0 or is_probe_due or self._poll_due() is not None
-
-    def _timing(self, link: Link) -> Timing:
-        config = self.config
-        return Timing(
-            config.response_timeout,
-            config.character_timeout_used,
-            0.0 if config.is_tcp else silence_s(config.baudrate, link.character_s),
-            config.delay,
-            config.turnaround,
-            link.character_s,
-        )
 
     def _broke(self, reason: str) -> None:
         """A connection that worked is made anew: devices close idle ones. Another is in trouble."""
@@ -280,19 +290,39 @@ class Master:
         began_s = self._clock.monotonic()
         if not self._offline or began_s < self._probes.due_s():
             return False
-        device = self._probes.pick(self._offline)
-        others = {outlet for outlet in self._by_outlet if outlet not in device.outlets}
-        command = self._queue.take(others)
-        if command is not None:
-            self._send_command(line, command)
-        elif device.polls:
-            index = self._schedule.pick(began_s, device.polls)
-            self._send_poll(line, _first_bit(device.polls) if index is None else index)
-        while not line.is_free and not self._stopping():
+        waiting = self._queue.waiting()
+        wanted = {device for device in self._offline if device.outlets & waiting}
+        is_sent = any(
+            self._probe(line, device, device in wanted) for device in self._probes.in_turn(self._offline, wanted)
+        )
+        while self._line is line and not line.is_free and not self._stopping():
             self._alive()
             line.advance(self._wait_limit_s)
         self._probes.spent(began_s, max(self._clock.monotonic(), began_s + PROBE_LEAST_S))
+        return is_sent
+
+    def _probe(self, line: Line, device: Device, is_wanted: bool) -> bool:
+        """Send what there is for *device*; False if there is nothing."""
+        others = {outlet for outlet in self._by_outlet if outlet not in device.outlets}
+        command = self._queue.take(others) if is_wanted else None
+        polls = 0 if command else self._sendable(device)
+        if command is None and not polls:
+            return False
+        self._probes.picked(device, is_wanted)
+        if command is not None:
+            self._send_command(line, command)
+        else:
+            index = self._schedule.pick(self._clock.monotonic(), polls)
+            self._send_poll(line, self._schedule.next_in_turn(polls) if index is None else index)
         return True
+
+    def _sendable(self, device: Device) -> int:
+        """Return the scheduled requests of *device*, as bits, without the writes that have no values yet."""
+        bits = 0
+        for index, poll in enumerate(self.polls[: self._scheduled]):
+            if poll.device is device and (poll.outlet is None or self._queue.cyclic_values(poll.outlet)):
+                bits |= 1 << index
+        return bits
 
     def _carry_out_poll(self, line: Line) -> bool:
         index = self._poll_due()
@@ -310,15 +340,15 @@ class Master:
     def _send_poll(self, line: Line, index: int) -> None:
         poll = self.polls[index]
         overruns = self._schedule.sent(index, self._clock.monotonic())
-        if not poll.device.is_offline:
-            poll.counters.overruns += overruns
-            self.counters.overruns += overruns
         number, data = 0, None
         if poll.outlet is not None:
             values = self._queue.cyclic_values(poll.outlet)
             if values is None:  # nobody has written all of its points yet
                 return
             data, number = values
+        if not poll.device.is_offline:
+            poll.counters.overruns += overruns
+            self.counters.overruns += overruns
         response = self._ask(line, poll, poll.request(data))
         if response is None:
             return
@@ -327,6 +357,8 @@ class Master:
 
     def _take_outcome(self, poll: Poll, index: int, number: int, response: Response) -> None:
         if response.has_error():
+            if poll.outlet is not None and response.error_code not in (TIMEOUT, DAMAGED):
+                self._queue.refused(poll.outlet, number)
             self._poll_failed(poll, index, response)
         elif poll.outlet is not None:
             self._queue.delivered(poll.outlet, number)
@@ -337,11 +369,12 @@ class Master:
 
     def _poll_succeeded(self, poll: Poll) -> None:
         poll.failed_tries = 0
-        if poll.is_bad:
-            poll.is_bad = False
+        if poll.is_bad and poll.outlet is not None:
+            self._queue.restore(poll.outlet)
+        poll.is_bad = False
+        if poll.is_told:
+            poll.is_told = False
             log.info("%s: good again", poll.source)
-            if poll.outlet is not None:
-                self._register.mark(poll.span, Quality.GOOD, poll.source)
 
     def _poll_failed(self, poll: Poll, index: int, response: Response) -> None:
         poll.failed_tries += 1
@@ -350,17 +383,14 @@ class Master:
             self._schedule.at_once(1 << index)
             return
         poll.failed_tries = 0
-        if not poll.is_bad and not poll.device.is_offline:
+        if not poll.is_told and not poll.device.is_offline:
+            poll.is_told = True
             log.warning("%s: %s", poll.source, response.reason)
         poll.spoil(self._register)
 
     def _send_command(self, line: Line, command: Command) -> None:
         poll = self._by_outlet[command.outlet]
-        try:
-            response = self._ask(line, poll, poll.command(command))
-        except LinkError:
-            self._queue.put_back(command)
-            raise
+        response = self._ask(line, poll, poll.command(command))
         if response is None or response.error_code in (TIMEOUT, DAMAGED):
             self._queue.put_back(command)
         elif response.has_error():
@@ -374,10 +404,8 @@ class Master:
 
     def _carry_out_ticket(self, line: Line, ticket: Ticket) -> None:
         self.counters.sent += 1
-        try:
-            ticket.response = self._transact(line, ticket.unit, ticket.request, None)
-        finally:
-            ticket.done.set()
+        ticket.response = self._transact(line, ticket.unit, ticket.request, None)
+        ticket.done.set()
         if ticket.response is not None:
             count_response(self.counters, ticket.response)
             if ticket.unit in self.devices:
@@ -395,12 +423,15 @@ class Master:
         return response
 
     def _transact(self, line: Line, unit: int, request: Request, timeout_s: float | None) -> Response | None:
-        began_s = self._clock.monotonic()
-        line.send(unit, request, timeout_s)
-        response = None
-        while response is None and not self._stopping():
-            response = line.advance(self._wait_limit_s)
-            self._alive()
+        began_s, response = self._clock.monotonic(), None
+        try:
+            line.send(unit, request, timeout_s)
+            while response is None and not self._stopping():
+                response = line.advance(self._wait_limit_s)
+                self._alive()
+        except LinkError as error:  # no answer either: whose request ends every connection is offline in the end
+            self._broke(str(error))
+            response = Response(unit, request.function, TIMEOUT, reason=str(error))
         self.busy_s += self._clock.monotonic() - began_s
         if response is not None:
             is_silent = response.error_code == TIMEOUT
@@ -435,6 +466,10 @@ class Master:
         self._offline.discard(device)
         self._online |= device.polls
         self._schedule.at_once(device.polls)
+        for poll in self.polls:
+            if poll.device is device and poll.outlet is not None:
+                poll.is_bad = bool(poll.outlet.dropped)
+                self._queue.restore(poll.outlet)
 
     # -------------------------------------------------------------------------------------------- by the way
 
@@ -463,7 +498,3 @@ class Master:
         if span is not None:
             status = poll.status(self._clock.monotonic(), not self.enabled)
             self._register.write(span, status, poll.source)
-
-
-def _first_bit(bits: int) -> int:
-    return (bits & -bits).bit_length() - 1

@@ -7,6 +7,7 @@ anything or knows the time: ``master.py`` does.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -15,9 +16,10 @@ from typing import Final
 from gateway.commands import Command, Outlet
 from gateway.config import MasterConfig, RequestConfig
 from gateway.counters import PollCounters
+from gateway.link import silence_s
 from gateway.modbus.pdu import ReadRequest, Request, Span, Table, WriteRequest, pack_words
 from gateway.register import DataRegister, Quality, Source, SourceKind
-from gateway.transaction import DAMAGED, NO_ERROR, TIMEOUT, Response
+from gateway.transaction import DAMAGED, NO_ERROR, TIMEOUT, Response, Timing
 
 OFFLINE_AFTER: Final = 3  # failures in a row
 PROBE_SHARE: Final = 11  # one part probing, ten parts polling: 9.1 % of the line's time, at most 10 % is allowed
@@ -60,6 +62,7 @@ class Poll:
     counters: PollCounters = field(default_factory=PollCounters)
     failed_tries: int = 0
     is_bad: bool = False
+    is_told: bool = False  # its failure has been logged
     last_good_s: float | None = None
     last_error: int = NO_ERROR
 
@@ -110,7 +113,9 @@ class Poll:
     def spoil(self, register: DataRegister) -> None:
         """Its points are bad; a read with ``on_failure = "zero"`` also gives zeros."""
         self.is_bad = True
-        if self.config.is_read and self.config.on_failure == "zero":
+        if self.outlet is not None:
+            register.mark_unfilled(self.span, Quality.BAD)
+        elif self.config.on_failure == "zero":
             register.write(self.span, bytes(self.span.size), self.source, Quality.BAD)
         else:
             register.mark(self.span, Quality.BAD, self.source)
@@ -173,25 +178,56 @@ def status_span(poll: Poll) -> Span | None:
     return Span(Table.INPUT_REGISTERS, point, STATUS_COUNT) if point >= 0 else None
 
 
+@dataclass(eq=False)
+class Ticket:
+    """A command from the menu, and later its response: None if it was never sent or the line was lost."""
+
+    unit: int
+    request: Request
+    made_s: float
+    response: Response | None = None
+    done: threading.Event = field(default_factory=threading.Event)
+
+
+def timing_of(master: MasterConfig, character_s: float) -> Timing:
+    """Return the times of the master's line; *character_s*: one character on the wire, 0 on TCP."""
+    return Timing(
+        master.response_timeout,
+        master.character_timeout_used,
+        0.0 if master.is_tcp else silence_s(master.baudrate, character_s),
+        master.delay,
+        master.turnaround,
+        character_s,
+    )
+
+
 class ProbeBudget:
     """When the next offline device may be tried: one at a time, in turn, at most 10 % of the line's time."""
 
     def __init__(self) -> None:
         self._next_s = 0.0
         self._last_unit = -1
+        self._wanted_last = False
 
     def due_s(self) -> float:
         """Return from when on a probe may be sent (monotonic seconds)."""
         return self._next_s
 
-    def pick(self, offline: Collection[Device]) -> Device:
-        """Return the offline device whose turn it is; *offline* has at least one."""
-        ordered = sorted(offline, key=lambda device: device.unit)
-        device = next((d for d in ordered if d.unit > self._last_unit), ordered[0])
-        self._last_unit = device.unit
-        return device
+    def in_turn(self, offline: Collection[Device], wanted: Collection[Device]) -> list[Device]:
+        """Return the offline devices in the order of their turns; every other time those *wanted* go first."""
+        ordered = sorted(offline, key=lambda device: (device.unit <= self._last_unit, device.unit))
+        if self._wanted_last:
+            return ordered
+        return sorted(ordered, key=lambda device: device not in wanted)
+
+    def picked(self, device: Device, is_wanted: bool) -> None:
+        """*device* is probed now."""
+        self._last_unit, self._wanted_last = device.unit, is_wanted
 
     def spent(self, began_s: float, free_s: float) -> None:
-        """A probe took the line from *began_s* until it is free again at *free_s*, listening included."""
-        share_s = (free_s - began_s) * PROBE_SHARE
-        self._next_s = began_s + min(share_s, max(PROBE_AT_LEAST_EVERY_S, free_s - began_s))
+        """A probe took the line from *began_s* until it is free again at *free_s*, listening included.
+
+        Where one takes more than 5 s, one a minute is more than the share; half of the time is the polls' in any case.
+        """
+        took_s = free_s - began_s
+        self._next_s = began_s + max(2 * took_s, min(PROBE_SHARE * took_s, PROBE_AT_LEAST_EVERY_S))

@@ -22,7 +22,7 @@ from enum import Enum, IntEnum
 from typing import Final
 
 from gateway.clock import Clock
-from gateway.errors import PointsOutOfRange, RequestInvalid
+from gateway.errors import PointsOutOfRange, PointUnknown, RequestInvalid
 from gateway.modbus.pdu import Span, Table
 
 SIZE_DEFAULT: Final = 2000
@@ -214,7 +214,7 @@ class DataRegister:
     def known(self, span: Span, commanded: bool = False) -> bytes | None:
         """Return the block, or None unless every point was written by someone.
 
-        commanded: only the upper side, a person or a retained value count as someone.
+        commanded: at least one of them by the upper side, a person or a retained value.
         """
         points = self._demand(span)
         with self._lock:
@@ -223,8 +223,9 @@ class DataRegister:
     @staticmethod
     def known_locked(points: _Points, span: Span, commanded: bool) -> bytes | None:
         """``known`` for whoever holds the lock already."""
-        written = points.commanded[span.start : span.stop] if commanded else points.time_s[span.start : span.stop]
-        return points.wire(span.start, span.stop) if min(written) > (0 if commanded else NEVER_S) else None
+        if commanded and not any(points.commanded[span.start : span.stop]):
+            return None
+        return points.wire(span.start, span.stop) if min(points.time_s[span.start : span.stop]) > NEVER_S else None
 
     # -------------------------------------------------------------------------------------------- writing
 
@@ -245,9 +246,14 @@ class DataRegister:
         self._tell(woken)
 
     def mask_write(self, span: Span, and_mask: int, or_mask: int, source: Source) -> None:
-        """Change one register as function 22 does, in one step; raises as ``write`` does."""
+        """Change one register as function 22 does, in one step.
+
+        raises: as ``write`` does; PointUnknown where a value that nobody wrote would go to a device.
+        """
         points = self._demand(span)
         with self._lock:
+            if points.time_s[span.start] == NEVER_S and any(sink.wants(span) for sink in self._sinks):
+                raise PointUnknown(f"nobody knows point {span.start} yet: a part of it cannot be sent to its device")
             old = int.from_bytes(points.wire(span.start, span.stop), "big")
             raw = (old & and_mask | or_mask & ~and_mask & 0xFFFF).to_bytes(2, "big")
             woken = self._write_locked(points, span, raw, source, Quality.GOOD)
@@ -259,6 +265,19 @@ class DataRegister:
         points = self._demand(span)
         with self._lock:
             points.quality[span.start : span.stop] = bytes([quality]) * span.count
+
+    def mark_unfilled(self, span: Span, quality: Quality) -> None:
+        """Like ``mark``, but only the points that no request fills: a failed write says nothing of what is read."""
+        points = self._demand(span)
+        with self._lock:
+            for point in self.unfilled_locked(points, span):
+                points.quality[point] = quality
+
+    @staticmethod
+    def unfilled_locked(points: _Points, span: Span) -> list[int]:
+        """Return the points of *span* that no request fills, to whoever holds the lock."""
+        filled = _stale_limits(points, span)
+        return [point for point in range(span.start, span.stop) if point not in filled]
 
     def claim(self, span: Span, source: Source, stale_after_s: float) -> Callable[[], None]:
         """Say that *source* fills *span*, and from what age its values are stale. Returns its own undo."""
@@ -332,10 +351,18 @@ class DataRegister:
         start, stop, count = span.start, span.stop, span.count
         points.values[start * points.width : stop * points.width] = raw
         points.quality[start:stop] = bytes([quality]) * count
-        points.time_s[start:stop] = array("d", [self._clock.monotonic()]) * count
+        now_s = self._clock.monotonic()
+        is_stand_in = source.kind is SourceKind.REQUEST and quality is Quality.BAD  # zeros for a failed poll
+        if is_stand_in:  # they make no point known that was not
+            times_s = [now_s if old_s > NEVER_S else old_s for old_s in points.time_s[start:stop]]
+            points.time_s[start:stop] = array("d", times_s)
+        else:
+            points.time_s[start:stop] = array("d", [now_s]) * count
         points.source[start:stop] = [source] * count
         if source.kind is not SourceKind.REQUEST:
             points.commanded[start:stop] = b"\x01" * count
+        elif is_stand_in:  # nobody wanted them written anywhere
+            points.commanded[start:stop] = bytes(count)
         if self._watchers:
             self._untold.append(Written(span, points.wire(start, stop), source, quality))
 

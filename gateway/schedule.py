@@ -33,7 +33,11 @@ class Schedule:
         ready = self._ready & among
         if not ready:
             return None
-        after = ready >> (self._last + 1) << (self._last + 1) or ready
+        return self.next_in_turn(ready)
+
+    def next_in_turn(self, among: int) -> int:
+        """Return the request after the last sent, due or not; *among* has at least one bit."""
+        after = among >> (self._last + 1) << (self._last + 1) or among
         return (after & -after).bit_length() - 1
 
     def sent(self, index: int, now_s: float) -> int:
@@ -49,10 +53,11 @@ class Schedule:
 
     def at_once(self, indexes: int) -> None:
         """Make the requests in the bits of *indexes* due now, and begin their cycles anew."""
-        for index in range(len(self._every_s)):
-            if indexes >> index & 1:
-                self._due_s[index] = None
         self._ready |= indexes
+        while indexes:
+            lowest = indexes & -indexes
+            self._due_s[lowest.bit_length() - 1] = None
+            indexes ^= lowest
 
     def next_due_s(self) -> float | None:
         """Return when the next request not yet due will be, or None."""

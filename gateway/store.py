@@ -1,30 +1,42 @@
 """The TOML file: loaded as a configuration, with the line of everything that is said about it.
 
 Loading changes nothing on the disk and never falls back to anything: a file that cannot be used is a ``ConfigError``
-that carries every finding, whatever the bytes in it. Saving is to come.
+that carries every finding, whatever the bytes in it. What depends on how a value is spelled is checked here, where the
+text is known. Saving is to come.
 
 Source: specification of rtugate, section 6. Any thread; nothing is shared.
 """
 
 from __future__ import annotations
 
+import os
 import re
+import stat
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from gateway import config_fields, toml_text
-from gateway.config import Config
+from gateway.config import FUNCTION_CODES, NATURAL_TABLES, Config
 from gateway.config_checks import not_yet, validate
 from gateway.config_fields import Finding, Severity
 from gateway.errors import ConfigError
+from gateway.modbus.pdu import Table
 
 LARGEST_FILE_BYTES: Final = 1024 * 1024
 BYTE_ORDER_MARK: Final = "\ufeff"
+NAME_CHARACTERS: Final = 255  # of a file that are shown
+
+REFERENCES: Final = {  # how handbooks number points; coils (1 to 9999) cannot be told from addresses
+    Table.DISCRETE_INPUTS: (10001, "discrete input"),
+    Table.INPUT_REGISTERS: (30001, "input register"),
+    Table.HOLDING_REGISTERS: (40001, "holding register"),
+}
 
 _TOML_PLACE: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+_DECIMAL: Final = re.compile(r"\+?[0-9][0-9_]*")
 _LONG_NUMBER: Final = re.compile(r"[0-9][0-9_]{4300}")
 _PLAIN_WORDS: Final = {  # what tomllib says of the commonest slips
     "Cannot overwrite a value": "this key is given twice",
@@ -50,7 +62,8 @@ class LocatedFinding:
     severity: Severity = "error"
 
     def __str__(self) -> str:
-        place = self.file_name if self.line is None else f"{self.file_name}:{self.line}"
+        name = config_fields.escaped(self.file_name, NAME_CHARACTERS)
+        place = name if self.line is None else f"{name}:{self.line}"
         severity = "" if self.severity == "error" else self.severity
         return ": ".join(part for part in (place, severity, self.subject, self.message) if part)
 
@@ -66,12 +79,22 @@ class Loaded:
 
 def load(path: Path) -> Loaded:
     """Return the configuration in the file at *path*; raises ConfigError with every finding."""
+    name = path.name or str(path)
     try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE_BYTES + 1)
+        content = _read(path, name)
     except OSError as error:
-        raise _unusable(path.name, None, f"cannot be read: {error.strerror or error}") from error
-    return load_text(content, path.name)
+        raise _unusable(name, None, f"cannot be read: {error.strerror or error}") from error
+    return load_text(content, name)
+
+
+def _read(path: Path, name: str) -> bytes:
+    """Return what is in a file; nothing else is even opened, since a FIFO waits and a device may act on it."""
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # of a directory the system itself says what it is
+        raise _unusable(name, None, "is not a regular file")
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # it may have become a FIFO since
+    with os.fdopen(descriptor, "rb") as file:
+        return file.read(LARGEST_FILE_BYTES + 1)
 
 
 def load_text(text: str | bytes, file_name: str) -> Loaded:
@@ -82,7 +105,9 @@ def load_text(text: str | bytes, file_name: str) -> Loaded:
     statements = toml_text.scan(decoded)
     data = _parse(decoded, statements, file_name)
     config, found = validate(data)
-    if config is None:
+    confused = list(_reference_numbers(decoded, data, statements))
+    found += confused
+    if config is None or confused:
         raise ConfigError(_locate(found, data, statements, file_name))
     return Loaded(config, decoded, _locate(found + not_yet(config), data, statements, file_name))
 
@@ -128,6 +153,34 @@ def _in_plain_words(text: str, document: str) -> tuple[int, str]:
     if place is None or place[1] is None:
         return document.rstrip("\n").count("\n") + 1, f"not TOML: {words}, at the end of the file"
     return int(place[1]), f"not TOML: {words} (column {place[2]})"
+
+
+def _reference_numbers(text: str, data: Mapping[str, Any], statements: list[toml_text.Statement]) -> Iterator[Finding]:
+    """Addresses that are spelled like a handbook's 40108; who really means that PDU address can spell it 0x9CAC."""
+    for statement in statements:
+        path = statement.path
+        if len(path) != 5 or path[::2] != ("master", "request", "address"):
+            continue
+        if _DECIMAL.fullmatch(text, statement.value_start, statement.end):
+            request = data["master"][path[1]]["request"][path[3]]
+            found = _confused(request["address"], request.get("function"))
+            if found:
+                yield Finding(path, found)
+
+
+def _confused(number: int, function: object) -> str | None:
+    """What is said of the address *number* if it is likely to be a reference number of *function*'s table."""
+    code = FUNCTION_CODES.get(function.replace("_", "-")) if isinstance(function, str) else function
+    table = NATURAL_TABLES.get(code) if type(code) is int else None
+    if table not in REFERENCES:
+        return None
+    first, point = REFERENCES[table]
+    if not first <= number < first + 9999:
+        return None
+    return (
+        f"address {number} looks like a reference number: for {point} {number} type address = {number - first}; "
+        f"if PDU address {number} is really meant, type 0x{number:04X}"
+    )
 
 
 def _locate(

@@ -129,7 +129,7 @@ class _Runner:
         return max(0.0, left_s)
 
     def wake(self) -> None:
-        self._waker.wake()
+        self._waker.end()
 
     def end(self, limit_s: float) -> bool:
         """Wait for the thread; True when it has ended."""

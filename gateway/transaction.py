@@ -236,6 +236,10 @@ class Line:
         """True when nothing is pending and no late reply is listened for."""
         return self._asked is None and self.state is State.IDLE
 
+    def silent_in_s(self) -> float:
+        """Return how long the line has to stay silent until a request would be sent at once; 0: it is by now."""
+        return max(0.0, self._silent_s() - self._clock.monotonic())
+
     def advance(self, wait_s: float) -> Response | None:
         """Wait at most *wait_s* for the next thing to happen, and return what became of the request, once.
 
@@ -249,7 +253,10 @@ class Line:
     # -------------------------------------------------------------------------------------------- inside
 
     def _step(self, wait_s: float) -> None:
-        if self.state is not State.AWAITING:  # a reply that came in time may lie unread: first look, then judge
+        if self.state not in (
+            State.AWAITING,
+            State.CONFIRMING,
+        ):  # a reply that came in time may lie unread: first look, then judge
             self._time_passes()
         if self._done is not None:
             return
@@ -417,11 +424,11 @@ class Line:
         self._pass(event)
         self._asked, self._reply = None, None
         self._done = Response(asked.unit, asked.request.function, code, b"", now_s - self._sent_s, reason)
-        if self.state is State.SPOILED:
+        if self.state is State.SPOILED and self._has_transactions:
+            self._pass(Event.SILENCE)  # a late reply is known by its number; half of one is not thrown away
+        elif self.state is State.SPOILED:
             self._framer.reset()
-            self._until_s = now_s + (0.0 if self._has_transactions else asked.timeout_s)
-            if self._has_transactions:
-                self._pass(Event.SILENCE)
+            self._until_s = now_s + asked.timeout_s
 
     def _finish(self, response: Response | None) -> None:
         self._pass(Event.SILENCE)

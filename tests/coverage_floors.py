@@ -14,7 +14,7 @@ FLOORS: list[tuple[str, float, Callable[[str], bool]]] = [
     ("gateway/modbus/", 95.0, lambda name: name.startswith("gateway/modbus/")),
     *(
         (f"gateway/{module}.py", 95.0, lambda name, module=module: name == f"gateway/{module}.py")
-        for module in ("register", "master", "slave", "store")
+        for module in ("register", "master", "slave", "slave_tcp", "store")
     ),
 ]
 

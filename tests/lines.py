@@ -21,10 +21,11 @@ from typing import Any, Protocol
 
 from gateway.clock import SystemClock
 from gateway.config import SlaveConfig
-from gateway.link import Waker, listen_tcp
+from gateway.link import Waker
+from gateway.link_tcp import listen_tcp
 from gateway.modbus.pdu import Span, Table
 from gateway.register import DataRegister, Source, SourceKind
-from gateway.slave import TcpSlave
+from gateway.slave_tcp import TcpSlave
 
 PATIENCE_S = 5.0  # for what must happen; a test that needs it has failed
 STOP_LIMIT_S = 2.0  # spec section 7: a clean stop takes under 2 s

@@ -24,12 +24,12 @@ FLOORS = [  # from the ground up; within a floor, in the order they may build on
         "modbus.identification",
     ],
     ["register", "toml_text", "config_fields", "config", "line_load", "config_checks"],
-    ["commands", "events", "modbus.server", "transaction", "link", "polls", "store"],
-    ["master", "slave", "supervisor", "simulator"],
+    ["commands", "events", "modbus.server", "transaction", "link", "link_tcp", "polls", "serving", "store"],
+    ["master", "slave", "slave_tcp", "supervisor", "simulator"],
     ["wiring"],
     ["demo", "cli"],
 ]
-TASKS = {"master", "slave"}
+TASKS = {"master", "slave", "slave_tcp"}
 PURE = {name for floor in FLOORS[:2] for name in floor} - {"clock"}
 OUTSIDE = {"os", "socket", "serial", "time", "select", "selectors", "subprocess"}
 PYMODBUS_USERS = {"simulator", "demo"}

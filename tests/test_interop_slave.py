@@ -18,10 +18,12 @@ from typing import Any
 import pytest
 
 from gateway.config import SlaveConfig
-from gateway.link import Link, SerialSettings, Waker, listen_tcp, open_serial
+from gateway.link import Link, SerialSettings, Waker, open_serial
+from gateway.link_tcp import listen_tcp
 from gateway.modbus.pdu import Span, Table, pack_bits, pack_words
 from gateway.register import DataRegister
-from gateway.slave import SerialSlave, TcpSlave
+from gateway.slave import SerialSlave
+from gateway.slave_tcp import TcpSlave
 from tests import peers
 from tests.lines import CLOCK, MENU, PATIENCE_S, UNIT, cable, holding, running, values
 

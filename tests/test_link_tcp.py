@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway import link as ports
+from gateway import link_tcp as ports
 from gateway.clock import SystemClock
 from gateway.errors import LinkError, LinkLost, LinkUnavailable
 from gateway.link import DescriptorLink, Link, Waker

@@ -19,9 +19,9 @@ from typing import Any
 import pytest
 
 from gateway.errors import LinkUnavailable
-from gateway.link import listen_tcp
+from gateway.link_tcp import listen_tcp
 from gateway.modbus.pdu import Span, Table
-from gateway.slave import RECEIVE_MAX, UNSENT_MAX
+from gateway.slave_tcp import RECEIVE_MAX, UNSENT_MAX
 from tests.lines import (
     FOUND,
     MENU,

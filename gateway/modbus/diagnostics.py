@@ -99,7 +99,7 @@ class LineDiagnostics:
             self.events = (self.events + 1) % COUNTER_LIMIT
         if not answered:
             self.unanswered = (self.unanswered + 1) % COUNTER_LIMIT
-        self.log.appendleft(SENT | SENT_EXCEPTION.get(exception, 0) | self._mode())
+        self.log.appendleft(SENT | (SENT_EXCEPTION.get(exception, 0) if answered else 0) | self._mode())
 
     def clear(self) -> None:
         """Set every counter to 0 (sub-functions 1 and 10)."""

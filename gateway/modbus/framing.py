@@ -136,14 +136,16 @@ class RtuRequestFramer:
     Frames are found by length and confirmed by silence: nothing is decided before ``silence()`` was called. What
     has come by then is read from its start, frame by frame; the CRC tells a request from a reply where both have the
     same function. Where that does not come out even: the whole may be one frame (functions whose length only silence
-    tells, requests that are too long or too short), or its end may be one. A frame that is not whole yet is kept,
-    unless a byte or two of noise only make it look so and the rest is a whole request.
+    tells, requests that are too long or too short), or its end may be one. What makes no sense is kept, because more
+    of it may come, until ``reset()``; or until a whole request stands at its end. A byte or two of noise before a
+    request may look like the start of something longer, and count as damage, too.
     """
 
     def __init__(self) -> None:
         self.damaged = 0
         self._held = bytearray()
         self._frames: deque[Frame] = deque()
+        self._is_counted = False  # what is held has been counted as damaged
 
     broken = False
 
@@ -178,18 +180,27 @@ class RtuRequestFramer:
             frames.append(_cut(held, position, len(held)))
             rest = 0
         elif rest:
-            is_lost = self._is_lost(position)
-            last = self._last_frame(position, len(held) if is_lost else position + NOISE_MAX)
-            if is_lost or last:
-                self.damaged += 1
+            latest = len(held) if self._is_lost(position) else position + NOISE_MAX
+            last = self._last_frame(position, latest)
+            if last or (latest == len(held) and self._ends(position)):
+                self._count_damage()
+            if last:
                 frames += last
                 rest = 0
         del held[: len(held) - rest]
+        self._is_counted &= rest > 0
         self._frames += frames
 
     def reset(self) -> None:
-        self.damaged += bool(self._held)
+        if self._held:
+            self._count_damage()
         self._held.clear()
+        self._is_counted = False
+
+    def _count_damage(self) -> None:
+        """What is held is damaged: that counts once, however long it is held."""
+        self.damaged += not self._is_counted
+        self._is_counted = True
 
     def _frame_end(self, start: int) -> int | None:
         """Where the frame that begins at *start* ends, if it is whole and its CRC right."""
@@ -208,7 +219,7 @@ class RtuRequestFramer:
         """True if no more bytes can turn what begins at *start* into a frame."""
         if len(self._held) - start < 2:
             return False
-        return all(stop <= len(self._held) for stop in self._ends(start))
+        return all(stop <= len(self._held) for stop in self._ends(start))  # also where only silence tells the end
 
     def _last_frame(self, start: int, latest: int) -> list[Frame]:
         """The request at the very end of what has come, begun after *start* and not after *latest*; else nothing."""

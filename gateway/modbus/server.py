@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from gateway.counters import ServeCounters
-from gateway.errors import QueueFull, RequestRefused
+from gateway.errors import PointUnknown, QueueFull, RequestRefused
 from gateway.modbus.diagnostics import LINE_FUNCTIONS, LineDiagnostics, LineReply, carry_out
 from gateway.modbus.identification import Identity, read_device_identification
 from gateway.modbus.pdu import (
@@ -96,12 +96,11 @@ def answer(request: bytes, server: Server, broadcast: bool = False) -> bytes:
             outcome = LineReply(b"", silent=True)  # only a restart is carried out
         else:
             outcome = _outcome(request, server)
+            server.counters.good += 1
     except RequestRefused as refused:
         code = refused.code
         outcome = LineReply(exception_reply(function, code), silent=line is not None and line.listen_only)
         server.counters.exceptions[code] += 1
-    else:
-        server.counters.good += 1
     if line is not None:
         line.carried_out(function, code, answered=not (outcome.silent or broadcast))
     outcome.then()
@@ -124,6 +123,8 @@ def _outcome(request: bytes, server: Server) -> LineReply:
         return LineReply(encode_reply(decoded, _carry_out(decoded, server)))
     except QueueFull:
         raise RequestRefused(ExceptionCode.SERVER_DEVICE_BUSY) from None
+    except PointUnknown:
+        raise RequestRefused(ExceptionCode.SERVER_DEVICE_FAILURE) from None
 
 
 def _read_fifo(request: bytes, server: Server) -> bytes:
