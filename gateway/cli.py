@@ -1,13 +1,12 @@
 """The `rtugate` command (spec section 9).
 
-Exit codes: 0 done, 1 the answer is no, 2 wrong usage. Errors go to stderr, a line each, never a traceback. A file that is
-not there is wrong usage; one that is there and cannot be used is an answer: `check` says no, `run` goes on without it.
+Exit codes: 0 done, 1 the answer is no, 2 wrong usage. Errors go to stderr, a line each, never a traceback. A file that
+is not there is wrong usage; one that is there and cannot be used is an answer: `check` says no, `run` goes on without.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 import logging
 import os
@@ -47,8 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _silence(sys.stdout)
     except OSError as error:  # a full disk behind our output
         _silence(sys.stdout)
-        with contextlib.suppress(OSError):
-            print(f"rtugate: the output cannot be written: {error.strerror or error}", file=sys.stderr)
+        _complain(f"rtugate: the output cannot be written: {error.strerror or error}")
     return 1
 
 
@@ -56,21 +54,32 @@ def _run_command(arguments: Sequence[str] | None) -> int:
     try:
         parsed = _parser().parse_args(arguments)
         return int(parsed.command(parsed))
-    finally:
-        if sys.stdout is not None:  # it is None when started with it closed
-            sys.stdout.flush()  # what cannot be written is told by us, not by the interpreter at its end
+    finally:  # what cannot be written is told here, not by the interpreter at its end
+        _complain()
+        if sys.stdout is not None:  # it is None when it was closed from the start
+            sys.stdout.flush()
 
 
-def _silence(stream: TextIO) -> None:
+def _complain(*lines: object) -> None:
+    """Print *lines* on stderr; where that cannot be written the exit code must do."""
+    try:
+        for line in lines:
+            print(line, file=sys.stderr)
+        if sys.stderr is not None:
+            sys.stderr.flush()
+    except OSError:
+        _silence(sys.stderr)
+
+
+def _silence(stream: TextIO | None) -> None:
     """Send what still waits in *stream* nowhere."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    if stream is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
     state = os.environ.get("STATE_DIRECTORY", STATE_DEFAULT)
-    common = _common_options(
-        argparse.SUPPRESS, argparse.SUPPRESS
-    )  # behind the command: no default overrides the others
+    common = _common_options(argparse.SUPPRESS, argparse.SUPPRESS)  # no default overrides what stood before the command
     parser = argparse.ArgumentParser(
         prog="rtugate",
         description="Modbus gateway: polls field devices, serves their data to SCADA.",
@@ -172,8 +181,7 @@ def _check(parsed: argparse.Namespace) -> int:
     try:
         loaded = load(path)
     except ConfigError as error:
-        for finding in error.findings:
-            print(finding, file=sys.stderr)
+        _complain(*error.findings)
         return 1
     print(f"{_shown(path)}: valid")
     _print_loads(loaded)
@@ -221,7 +229,7 @@ def _is_missing(path: Path) -> bool:
 
 
 def _no_such_file(path: Path) -> int:
-    print(f"rtugate: {_shown(path)}: no such file", file=sys.stderr)
+    _complain(f"rtugate: {_shown(path)}: no such file")
     return 2
 
 

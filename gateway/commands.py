@@ -236,6 +236,8 @@ class CommandQueue(CommandSink):
 
     def delivered(self, outlet: Outlet, number: int) -> None:
         """The device has taken a cyclic request that carried everything up to *number*."""
+        with self._register.lock:
+            outlet.dropped.clear()  # all its points went along
         self._settle(outlet, outlet.span, number, is_delivered=True)
 
     def refused(self, outlet: Outlet, number: int) -> None:

@@ -23,18 +23,8 @@ from gateway.config import MasterConfig
 from gateway.counters import PollCounters
 from gateway.errors import LinkError, QueueFull
 from gateway.link import Link, Waker
-from gateway.modbus.pdu import Request
-from gateway.polls import (
-    OFFLINE_AFTER,
-    Device,
-    Poll,
-    ProbeBudget,
-    Ticket,
-    count_response,
-    polls_of,
-    status_span,
-    timing_of,
-)
+from gateway.modbus.pdu import AnyRequest
+from gateway.polls import Device, Poll, ProbeBudget, Ticket, count_response, polls_of, status_span, timing_of
 from gateway.register import DataRegister
 from gateway.schedule import Schedule
 from gateway.transaction import DAMAGED, TIMEOUT, Line, Response, check_asked
@@ -123,7 +113,7 @@ class Master:
         self.enabled = enabled
         self.wake()
 
-    def submit(self, unit: int, request: Request) -> Ticket:
+    def submit(self, unit: int, request: AnyRequest) -> Ticket:
         """Queue a command before all polls. Raises QueueFull, RequestInvalid; the ticket's event tells when done.
 
         It is given up, like any command, when it could not be sent within 10 s.
@@ -188,12 +178,18 @@ class Master:
             self._renew("nothing answers")
             return
         if not line.is_free or (line.silent_in_s() and not self._is_never_silent()):
-            line.advance(min(line.silent_in_s() or self._wait_limit_s, self._wait_limit_s))
+            self._listen(line)
             return  # nothing is taken before it can be sent at once: a newer value may come meanwhile
         self._busy_since_s = None
         if self._carry_out_command(line) or self._carry_out_probe(line) or self._carry_out_poll(line):
             return
         line.advance(self._wait_s())
+
+    def _listen(self, line: Line) -> None:
+        """Let a spoiled line, or the silence before the next request, get on: that is time in use, too."""
+        began_s = self._clock.monotonic()
+        line.advance(min(line.silent_in_s() or self._wait_limit_s, self._wait_limit_s))
+        self.busy_s += self._clock.monotonic() - began_s
 
     def _is_never_silent(self) -> bool:
         """True when the line has babbled for a whole response timeout: polls then fail, and say so."""
@@ -230,12 +226,12 @@ class Master:
         finally:
             self.ready.set()
         log.debug("%s: polling on %s", self.name, self.config.line)
-        self._line = Line(
-            self._link, self.config.framing_used, timing_of(self.config, self._link.character_s), self._clock
-        )
+        timing = timing_of(self.config, self._link.character_s)
+        self._line = Line(self._link, self.config.framing_used, timing, self._clock)
+        again = self._schedule.due(self._clock.monotonic()) if self._is_resting else (1 << self._scheduled) - 1
+        self._schedule.at_once(again)  # what was missed meanwhile is no overrun
         self._silent_in_row = 0
         self._has_answered = self._is_resting = False
-        self._schedule.at_once((1 << self._scheduled) - 1)  # what was missed meanwhile is no overrun
 
     def _is_work_due(self) -> bool:
         is_probe_due = bool(self._offline) and self._clock.monotonic() >= self._probes.due_s()
@@ -297,7 +293,7 @@ class Master:
         )
         while self._line is line and not line.is_free and not self._stopping():
             self._alive()
-            line.advance(self._wait_limit_s)
+            self._listen(line)
         self._probes.spent(began_s, max(self._clock.monotonic(), began_s + PROBE_LEAST_S))
         return is_sent
 
@@ -411,7 +407,7 @@ class Master:
             if ticket.unit in self.devices:
                 self._judge(self.devices[ticket.unit], ticket.response)
 
-    def _ask(self, line: Line, poll: Poll, request: Request) -> Response | None:
+    def _ask(self, line: Line, poll: Poll, request: AnyRequest) -> Response | None:
         """Send *request* and wait for what becomes of it; None when stopped on the way."""
         poll.counters.sent += 1
         self.counters.sent += 1
@@ -422,7 +418,7 @@ class Master:
             self._judge(poll.device, response)
         return response
 
-    def _transact(self, line: Line, unit: int, request: Request, timeout_s: float | None) -> Response | None:
+    def _transact(self, line: Line, unit: int, request: AnyRequest, timeout_s: float | None) -> Response | None:
         began_s, response = self._clock.monotonic(), None
         try:
             line.send(unit, request, timeout_s)
@@ -430,7 +426,10 @@ class Master:
                 response = line.advance(self._wait_limit_s)
                 self._alive()
         except LinkError as error:  # no answer either: whose request ends every connection is offline in the end
-            self._broke(str(error))
+            if self.config.is_tcp and self._online:  # of no concern to those who answer
+                self._renew(str(error))
+            else:
+                self._broke(str(error))
             response = Response(unit, request.function, TIMEOUT, reason=str(error))
         self.busy_s += self._clock.monotonic() - began_s
         if response is not None:
@@ -450,10 +449,8 @@ class Master:
             if device.is_offline:
                 self._back(device)
             return
-        device.failures_in_row += 1
-        if device.failures_in_row >= OFFLINE_AFTER and not device.is_offline:
+        if device.failed():
             log.warning("%s: unit %d is offline: %s", self.name, device.unit, response.reason)
-            device.is_offline = True
             self._offline.add(device)
             self._online &= ~device.polls
             for poll in self.polls:

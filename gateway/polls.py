@@ -17,7 +17,7 @@ from gateway.commands import Command, Outlet
 from gateway.config import MasterConfig, RequestConfig
 from gateway.counters import PollCounters
 from gateway.link import silence_s
-from gateway.modbus.pdu import ReadRequest, Request, Span, Table, WriteRequest, pack_words
+from gateway.modbus.pdu import AnyRequest, ReadRequest, Request, Span, Table, WriteRequest, pack_words
 from gateway.register import DataRegister, Quality, Source, SourceKind
 from gateway.transaction import DAMAGED, NO_ERROR, TIMEOUT, Response, Timing
 
@@ -48,6 +48,13 @@ class Device:
     is_offline: bool = False
     polls: int = 0
     outlets: set[Outlet] = field(default_factory=set)
+
+    def failed(self) -> bool:
+        """Count a failure; return True if it is the one that takes the device offline."""
+        self.failures_in_row += 1
+        goes_offline = self.failures_in_row >= OFFLINE_AFTER and not self.is_offline
+        self.is_offline |= goes_offline
+        return goes_offline
 
 
 @dataclass(eq=False)
@@ -180,10 +187,13 @@ def status_span(poll: Poll) -> Span | None:
 
 @dataclass(eq=False)
 class Ticket:
-    """A command from the menu, and later its response: None if it was never sent or the line was lost."""
+    """A command from the menu, and later its response: None if it was never sent or the master was stopped.
+
+    A line lost on the way is a timeout whose reason says so.
+    """
 
     unit: int
-    request: Request
+    request: AnyRequest
     made_s: float
     response: Response | None = None
     done: threading.Event = field(default_factory=threading.Event)

@@ -35,6 +35,11 @@ class Schedule:
             return None
         return self.next_in_turn(ready)
 
+    def due(self, now_s: float) -> int:
+        """Return the requests that are due, as bits."""
+        self._wake_due(now_s)
+        return self._ready
+
     def next_in_turn(self, among: int) -> int:
         """Return the request after the last sent, due or not; *among* has at least one bit."""
         after = among >> (self._last + 1) << (self._last + 1) or among

@@ -26,7 +26,7 @@ from gateway.clock import Clock, SystemClock
 from gateway.errors import DeviceRefused, LinkLost, ReplyMismatch, RequestInvalid
 from gateway.modbus import pdu
 from gateway.modbus.framing import RTU_MAX, Frame, Framing, reply_framer
-from gateway.modbus.pdu import BROADCAST, ReadRequest, Request, WriteRequest
+from gateway.modbus.pdu import BROADCAST, AnyRequest, ReadRequest, WriteRequest
 
 NO_ERROR: Final = 0
 DAMAGED: Final = 0xFFFE  # error codes of our own, beyond the exceptions 1 to 255
@@ -142,7 +142,7 @@ class Timing:
 @dataclass(frozen=True)
 class _Asked:
     unit: int
-    request: Request
+    request: AnyRequest
     timeout_s: float
 
 
@@ -215,7 +215,7 @@ class Line:
 
     # -------------------------------------------------------------------------------------------- for the master
 
-    def send(self, unit: int, request: Request, timeout_s: float | None = None) -> bool:
+    def send(self, unit: int, request: AnyRequest, timeout_s: float | None = None) -> bool:
         """Send *request* to *unit*; at once if the line has been silent long enough, else as soon as it has.
 
         unit:      0 to 255; 0 is a broadcast except on Modbus TCP, and only for writes.
@@ -401,6 +401,7 @@ class Line:
             self._heard(unread)
             return
         self._transaction = (self._transaction + 1) & 0xFFFF
+        self._framer.reset()  # half a reply that has not become whole by now never will
         self._framer.expect(asked.unit, asked.request.function)
         self._framer.damaged = 0
         frame = Frame(asked.unit, pdu.encode_request(asked.request), self._transaction)
@@ -425,7 +426,7 @@ class Line:
         self._asked, self._reply = None, None
         self._done = Response(asked.unit, asked.request.function, code, b"", now_s - self._sent_s, reason)
         if self.state is State.SPOILED and self._has_transactions:
-            self._pass(Event.SILENCE)  # a late reply is known by its number; half of one is not thrown away
+            self._pass(Event.SILENCE)  # a late reply is known by its number; half of one may become whole until then
         elif self.state is State.SPOILED:
             self._framer.reset()
             self._until_s = now_s + asked.timeout_s
@@ -442,7 +443,7 @@ class Line:
             self._traffic(sent, data)
 
 
-def check_asked(unit: int, request: Request, has_broadcast: bool) -> None:
+def check_asked(unit: int, request: AnyRequest, has_broadcast: bool) -> None:
     """Raise RequestInvalid unless *request* can be sent to *unit*; *has_broadcast*: unit 0 is all, and none answers."""
     if not 0 <= unit <= 255:
         raise RequestInvalid(f"unit {unit} is not within 0 to 255")

@@ -79,7 +79,7 @@ class JumpingWaker(Waker):
 
     def __init__(self, clock: JumpingClock) -> None:
         self._clock = clock
-        self.is_woken = False
+        self.is_woken = self.ended = False
         self.waits_s: list[float] = []
 
     def wake(self) -> None:

@@ -211,7 +211,7 @@ class RtuRequestFramer:
 
     def _ends(self, start: int) -> list[int]:
         """Where a request, and where a reply, that begins at *start* would end, if not too long; shortest first."""
-        head = self._held[start + 1 : start + 12]
+        head = self._held[start + 1 : start + 1 + PDU_MAX]
         lengths = (pdu_length(shapes, head) for shapes in (REQUEST_SHAPES, REPLY_SHAPES))
         return sorted({start + 1 + length + 2 for length in lengths if length and length <= PDU_MAX})
 
@@ -308,7 +308,7 @@ class RtuReplyFramer:
 
     def _end(self) -> int:
         """Where the frame ends, as far as can be told yet; a function without a length ends with what has come."""
-        length = pdu_length(REPLY_SHAPES, self._held[1:5])
+        length = pdu_length(REPLY_SHAPES, self._held[1 : 1 + PDU_MAX])
         return 1 + length + 2 if length else max(len(self._held), RTU_MIN)
 
 

@@ -85,6 +85,9 @@ QUANTITY_LIMITS: Final[dict[int, int]] = {
 READ_WRITE_READ_LIMIT: Final = 125  # section 6.17
 READ_WRITE_WRITE_LIMIT: Final = 121
 
+# Bytes after the function code: sections 6.7, 6.8 (one word of data), 6.9, 6.10, 6.13, 6.18, 6.21.
+PLAIN_BODY_SIZES: Final[dict[int, int]] = {7: 0, 8: 4, 11: 0, 12: 0, 17: 0, 24: 2, 43: 3}
+
 TABLE_OF: Final[dict[int, Table]] = {
     1: Table.COILS,
     2: Table.DISCRETE_INPUTS,
@@ -169,7 +172,16 @@ class ReadWriteRequest:
     function: int = Function.READ_WRITE_MULTIPLE_REGISTERS
 
 
-Request = ReadRequest | WriteRequest | MaskWriteRequest | ReadWriteRequest
+@dataclass(frozen=True, slots=True)
+class PlainRequest:
+    """Functions 7, 8, 11, 12, 17, 24 and 43, for commands of the master: *body* is all after the function code."""
+
+    function: int
+    body: bytes = b""
+
+
+Request = ReadRequest | WriteRequest | MaskWriteRequest | ReadWriteRequest  # moves data
+AnyRequest = Request | PlainRequest
 
 
 # ------------------------------------------------------------------------------------------------ bits and words
@@ -199,7 +211,7 @@ def word_at(data: bytes, index: int) -> int:
 # ------------------------------------------------------------------------------------------------ requests
 
 
-def encode_request(request: Request) -> bytes:
+def encode_request(request: AnyRequest) -> bytes:
     """Return the PDU of *request*: function code and body, 5 to 253 bytes.
 
     raises: RequestInvalid where a limit of sections 6.1 to 6.17 is broken: nothing wrong ever leaves the house.
@@ -226,9 +238,11 @@ def encode_request(request: Request) -> bytes:
                 + bytes([len(request.data)])
                 + request.data
             )
+        case PlainRequest():
+            return bytes([request.function]) + request.body
 
 
-def check_request(request: Request) -> None:
+def check_request(request: AnyRequest) -> None:
     """Raise RequestInvalid, in words, unless *request* keeps every limit of the specification."""
     match request:
         case ReadRequest():
@@ -249,6 +263,9 @@ def check_request(request: Request) -> None:
             _check_range(request.address, request.quantity, READ_WRITE_READ_LIMIT)
             _check_range(request.write_address, request.write_quantity, READ_WRITE_WRITE_LIMIT)
             _check_size(request.data, Span(Table.HOLDING_REGISTERS, 0, request.write_quantity))
+        case PlainRequest():
+            if PLAIN_BODY_SIZES.get(request.function) != len(request.body):
+                raise RequestInvalid(f"function {request.function} with {len(request.body)} bytes is no request")
 
 
 def _check_range(address: int, quantity: int, limit: int) -> None:
@@ -348,11 +365,12 @@ def exception_reply(function: int, code: int) -> bytes:
     return bytes([(function | EXCEPTION_BIT) & 0xFF, code])
 
 
-def decode_reply(request: Request, pdu: bytes) -> bytes:
+def decode_reply(request: AnyRequest, pdu: bytes) -> bytes:
     """Return the data that *pdu* carries in answer to *request*.
 
     pdu:     function code and body, 1 to 253 bytes; unit and checksum already gone.
-    returns: big-endian words or packed bits as on the wire, unused bits cleared; b"" for a write.
+    returns: big-endian words or packed bits as on the wire, unused bits cleared; b"" for a write; all after the
+             function code for a ``PlainRequest``.
     raises:  ReplyMismatch (answer to another question), DeviceRefused (exception reply).
     source:  sections 6.1 to 6.17 and 7.
     """
@@ -364,6 +382,11 @@ def decode_reply(request: Request, pdu: bytes) -> bytes:
         raise ReplyMismatch(f"a reply to function {pdu[0] if pdu else None}")
     if isinstance(request, ReadRequest | ReadWriteRequest):
         return _decode_data(request, pdu)
+    if isinstance(request, PlainRequest):
+        repeated = {8: 2, 43: 2}.get(request.function, 0)  # sub-function; MEI type and code
+        if len(pdu) != pdu_length(REPLY_SHAPES, pdu) or pdu[1 : 1 + repeated] != request.body[:repeated]:
+            raise ReplyMismatch(f"no reply to function {request.function} as it was asked")
+        return pdu[1:]
     if pdu != _echo(request):
         raise ReplyMismatch("the reply does not repeat address and value of the request")
     return b""
@@ -398,10 +421,14 @@ def _word(value: int) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """How long a PDU is: *fixed* bytes, and as many more as the byte at *count_at* says."""
+    """How long a PDU is: *fixed* bytes, and as many more as the byte at *count_at* says.
+
+    objects: after *fixed* bytes come as many objects as the last of them says, each with a number and a length.
+    """
 
     fixed: int
     count_at: int | None = None
+    objects: bool = False
 
 
 # Sections 6.1 to 6.21. Where a function is missing, only silence can tell where its frame ends.
@@ -421,6 +448,7 @@ REPLY_SHAPES: Final[dict[int, Shape]] = {
     7: Shape(2),
     22: Shape(7),
     24: Shape(3, 2),
+    43: Shape(7, objects=True),
     **{function | EXCEPTION_BIT: Shape(2) for function in range(1, 128)},
 }
 
@@ -433,6 +461,17 @@ def pdu_length(shapes: dict[int, Shape], pdu: bytes | bytearray) -> int | None:
     shape = shapes.get(pdu[0]) if pdu else None
     if shape is None:
         return None
+    if shape.objects:
+        return _length_with_objects(shape.fixed, pdu)
     if shape.count_at is None:
         return shape.fixed
     return shape.fixed + (pdu[shape.count_at] if len(pdu) > shape.count_at else 0)
+
+
+def _length_with_objects(end: int, pdu: bytes | bytearray) -> int:
+    """Return where the objects of section 6.21 that begin at *end* end, or as far as can be told."""
+    for _ in range(pdu[end - 1] if len(pdu) >= end else 0):
+        if len(pdu) < end + 2:
+            return end + 2
+        end += 2 + pdu[end + 1]
+    return end
