@@ -42,14 +42,21 @@ def test_once_it_worked_the_next_failure_waits_briefly_again(clock: JumpingClock
     assert backoff.wait_s() == FIRST_S
 
 
-def test_a_reason_is_news_once_and_logged_once(clock: JumpingClock, caplog: pytest.LogCaptureFixture) -> None:
+def test_trouble_is_one_error_until_the_line_has_worked_again_whatever_the_reason(
+    clock: JumpingClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("DEBUG")
     backoff = Backoff("field", clock)
-    assert [backoff.failed("no port"), backoff.failed("no port"), backoff.failed("busy")] == [True, False, True]
-    assert backoff.trouble == "busy"
-    assert [record.getMessage() for record in caplog.records] == [
-        "field: no port; trying again",
-        "field: busy; trying again",
+    assert [backoff.failed("no port"), backoff.failed("no port"), backoff.failed("busy")] == [True, False, False]
+    assert backoff.trouble == "busy"  # what a person sees is the latest
+    assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
+        ("ERROR", "field: no port; trying again"),
+        ("DEBUG", "field: no port; trying again"),
+        ("DEBUG", "field: busy; trying again"),
     ]
+    backoff.worked()
+    assert backoff.failed("busy")
+    assert (caplog.records[-1].levelname, backoff.failed("busy")) == ("ERROR", False)
 
 
 def test_that_it_works_is_logged_only_after_trouble(clock: JumpingClock, caplog: pytest.LogCaptureFixture) -> None:

@@ -380,12 +380,14 @@ def test_a_write_that_does_not_fit_is_refused_whole_and_stores_nothing(
     register: DataRegister, queue: CommandQueue
 ) -> None:
     fill(register, queue)
+    poll(register, 900, 5)
     told: list[object] = []
     register.watch(told.append)
     with pytest.raises(QueueFull):
         scada(register, 999, 7, 7)
     with pytest.raises(QueueFull):
-        register.mask_write(holding(999), 0, 7, SCADA)
+        register.mask_write(holding(900), 0, 7, SCADA)
+    assert values(register, 900) == [5]
     assert (values(register, 999, 2), qualities(register, 999, 2), told) == ([0, 0], [Quality.NEVER] * 2, [])
     poll(register, 999, 8)
     assert values(register, 999) == [8]  # and holds nothing
@@ -456,13 +458,22 @@ def test_a_cyclic_request_does_not_send_a_device_what_only_the_device_said(
 ) -> None:
     cyclic = outlet(10, 2, on_change=False, commanded_only=True)
     queue.add(cyclic)
+    scada(register, 20, 1)
     poll(register, 10, 8, 9)
-    scada(register, 10, 1)
     assert queue.cyclic_values(cyclic) is None
-    scada(register, 11, 2, source=MENU)
+    scada(register, 10, 1)  # one point; the other goes along as the device itself has it
     sent = queue.cyclic_values(cyclic)
     assert sent is not None
-    assert sent[0] == words(1, 2)
+    assert sent[0] == words(1, 9)
+
+
+def test_a_cyclic_request_waits_for_a_point_that_its_own_device_has_not_said_yet(
+    register: DataRegister, queue: CommandQueue
+) -> None:
+    cyclic = outlet(10, 2, on_change=False, commanded_only=True)
+    queue.add(cyclic)
+    scada(register, 10, 1, source=MENU)
+    assert queue.cyclic_values(cyclic) is None
 
 
 def test_a_cyclic_request_holds_what_was_written_until_it_is_delivered(

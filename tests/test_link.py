@@ -123,6 +123,16 @@ def test_a_wake_from_another_thread_ends_a_wait_without_limit(waker: Waker) -> N
     thread.join()
 
 
+def test_an_ended_waker_ends_every_wait_for_good_whatever_is_cleared(pty: Pty, waker: Waker) -> None:
+    with contextlib.closing(ports.open_serial(pty.settings(), waker, CLOCK)) as line:
+        threading.Thread(target=waker.end).start()
+        assert waker.wait(PATIENCE_S)
+        waker.clear()
+        assert seconds(lambda: line.read(PATIENCE_S)) < PATIENCE_S / 2
+        assert waker.wait(PATIENCE_S)
+        assert waker.ended
+
+
 def test_a_signal_handler_may_wake(waker: Waker) -> None:
     def handler(number: int, frame: FrameType | None) -> None:
         waker.wake()

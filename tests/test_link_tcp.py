@@ -208,13 +208,23 @@ def test_a_device_that_does_not_answer_is_given_up_in_time(full_listener: socket
     assert 0.2 <= CLOCK.monotonic() - started < 1.5
 
 
-def test_a_wake_ends_connecting_and_is_cleared(full_listener: socket.socket, waker: Waker) -> None:
-    thread = threading.Thread(target=waker.wake)
+def test_a_wake_does_not_end_connecting(full_listener: socket.socket, waker: Waker) -> None:
+    """SCADA writes all the time; a device that takes a moment to accept is still connected to."""
+    waker.wake()
+    started = CLOCK.monotonic()
+    with pytest.raises(LinkUnavailable, match=r"^tcp 127\.0\.0\.1:\d+: no answer within 0\.2 s$"):
+        ports.connect_tcp("127.0.0.1", port_of(full_listener), waker, CLOCK, 0.2)
+    assert 0.2 <= CLOCK.monotonic() - started < 1.5
+
+
+def test_the_wakers_end_ends_connecting_and_is_not_forgotten(full_listener: socket.socket, waker: Waker) -> None:
+    thread = threading.Thread(target=waker.end)
     thread.start()
     with pytest.raises(LinkUnavailable, match=r"^tcp 127\.0\.0\.1:\d+: interrupted$"):
         ports.connect_tcp("127.0.0.1", port_of(full_listener), waker, CLOCK, PATIENCE_S)
     thread.join()
-    assert not waker.wait(0)
+    assert waker.wait(0)
+    assert waker.wait(0)
 
 
 @pytest.mark.parametrize("host", ["no-such-device.invalid", "a..b", "a" * 300, "nul\0l", "1.2.3.4.5"])
@@ -254,8 +264,14 @@ def test_a_slow_resolver_is_given_up_in_time(slow_resolver: None, waker: Waker) 
         ports.connect_tcp("plc.example", 502, waker, CLOCK, 0.05)
 
 
-def test_a_wake_ends_waiting_for_a_slow_resolver(slow_resolver: None, waker: Waker) -> None:
+def test_a_wake_does_not_end_waiting_for_a_slow_resolver(slow_resolver: None, waker: Waker) -> None:
     waker.wake()
+    with pytest.raises(LinkUnavailable, match="no name server answers"):
+        ports.connect_tcp("plc.example", 502, waker, CLOCK, 0.05)
+
+
+def test_the_wakers_end_ends_waiting_for_a_slow_resolver(slow_resolver: None, waker: Waker) -> None:
+    waker.end()
     with pytest.raises(LinkUnavailable, match=r"^tcp plc\.example:502: interrupted$"):
         ports.connect_tcp("plc.example", 502, waker, CLOCK, 60.0)
 

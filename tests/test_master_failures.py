@@ -175,12 +175,18 @@ def test_several_silent_devices_share_one_budget_in_turn() -> None:
     assert all({a, b, c} == {2, 5, 9} for a, b, c in zip(tried, tried[1:], tried[2:], strict=False))
 
 
-def test_a_probe_longer_than_a_minutes_tenth_is_still_sent_every_minute(clock: JumpingClock) -> None:
-    it = MasterBench(clock, reads(1, 100, response_timeout=20.0), reads(2, 200))
+@pytest.mark.parametrize(("timeout_s", "every_s"), [(10.0, 60.0), (14.5, 60.0), (20.0, 80.0), (60.0, 240.0)])
+def test_a_long_probe_is_sent_every_minute_unless_that_takes_more_than_half_of_the_line(
+    clock: JumpingClock, timeout_s: float, every_s: float
+) -> None:
+    """A probe takes its timeout, and as long again to listen."""
+    it = MasterBench(clock, reads(1, 100, response_timeout=timeout_s), reads(2, 200))
     it.field.silent = {1}
-    it.run_s(1200.0)
+    it.run_s(12 * every_s)
     tried_s = [when_s for when_s, unit, _ in it.field.asked if unit == 1][4:]
-    assert [b - a for a, b in pairwise(tried_s)] == pytest.approx([60.0] * (len(tried_s) - 1), abs=1)
+    assert len(tried_s) >= 5
+    assert [b - a for a, b in pairwise(tried_s)] == pytest.approx([every_s] * (len(tried_s) - 1), abs=1)
+    assert it.field.count(2) >= 0.4 * 12 * every_s
 
 
 def test_with_every_device_silent_the_line_is_probed_and_does_not_turn(clock: JumpingClock) -> None:
@@ -194,7 +200,7 @@ def test_with_every_device_silent_the_line_is_probed_and_does_not_turn(clock: Ju
 
 
 def test_an_offline_device_with_nothing_to_send_is_passed_over(clock: JumpingClock) -> None:
-    it = MasterBench(clock, writes(1, 100), reads(2, 200))
+    it = MasterBench(clock, writes(1, 100, expire=20.0), reads(2, 200))  # each of three tries takes 2.5 s twice
     it.field.silent = {1}
     it.scada(100, 5)
     it.run_s(60.0)

@@ -340,6 +340,14 @@ def test_a_mark_makes_nothing_known(register: DataRegister) -> None:
     assert register.known(holding(0)) is None
 
 
+def test_one_point_that_others_wrote_makes_a_known_block_a_command(register: DataRegister) -> None:
+    register.write(holding(0, 2), words(1, 2), POLL)
+    assert register.known(holding(0, 2), commanded=True) is None
+    register.write(holding(1), words(5), SCADA)
+    assert register.known(holding(0, 2), commanded=True) == words(1, 5)
+    assert register.known(holding(1, 2), commanded=True) is None  # nobody knows point 2
+
+
 @pytest.mark.parametrize("source", [SCADA, MENU, RETAINED], ids=lambda source: str(source.kind.value))
 def test_what_a_request_read_is_no_command_but_what_others_wrote_is(register: DataRegister, source: Source) -> None:
     register.write(holding(0), words(1), POLL)
@@ -375,6 +383,7 @@ def test_a_mask_write_changes_the_masked_bits(
 
 def test_two_mask_writes_at_the_same_time_lose_no_bit(case: tuple[DataRegister, InterruptedClock, bool]) -> None:
     register, clock, has_lock = case
+    register.write(holding(0), words(0), POLL)
     register.add_sink(InterruptedSink(clock))
     first = partial(register.mask_write, holding(0), 0xFFFE, 0x0001, SCADA)
     interrupted(register, clock, first, partial(register.mask_write, holding(0), 0x7FFF, 0x8000, MENU))
