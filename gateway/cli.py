@@ -56,17 +56,18 @@ def _run_command(arguments: Sequence[str] | None) -> int:
         return int(parsed.command(parsed))
     finally:  # what cannot be written is told here, not by the interpreter at its end
         _complain()
-        if sys.stdout is not None:  # it is None when it was closed from the start
+        if sys.stdout is not None:
             sys.stdout.flush()
 
 
 def _complain(*lines: object) -> None:
     """Print *lines* on stderr; where that cannot be written the exit code must do."""
+    if sys.stderr is None:  # closed from the start
+        return
     try:
         for line in lines:
             print(line, file=sys.stderr)
-        if sys.stderr is not None:
-            sys.stderr.flush()
+        sys.stderr.flush()
     except OSError:
         _silence(sys.stderr)
 

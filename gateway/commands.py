@@ -30,8 +30,8 @@ class Outlet:
 
     on_change:      each write makes a command; False: the request is sent by cycle and only holds its points.
     whole:          a command carries all of *span*, not only what was written.
-    commanded_only: a cyclic request is sent only once the upper side or a person wrote one of its points, because the
-                    same device fills them, too, and what it said is not sent back to it for nothing.
+    commanded_only: the same device fills these points, too: a cyclic request is sent only once the upper side or a
+                    person wrote one of them, and never with zeros that stand for a failed poll.
     expire_s:       a command not delivered for so long is dropped; 0: never.
     """
 
@@ -266,12 +266,13 @@ class CommandQueue(CommandSink):
             self._release(outlet, points)
 
     def _judge(self, outlet: Outlet, points: Iterable[int], is_delivered: bool) -> None:
-        """Points not delivered are bad; delivered ones are no longer, if their device was offline meanwhile."""
-        quality = self._register.points_locked(outlet.span.table).quality
+        """Points not delivered are bad; delivered ones no longer, but what a request reads is its affair alone."""
+        table = self._register.points_locked(outlet.span.table)
+        quality, unfilled = table.quality, set(self._register.unfilled_locked(table, outlet.span))
         for point in points:
             outlet.dropped.discard(point)
             if not is_delivered:
                 outlet.dropped.add(point)
                 quality[point] = Quality.BAD
-            elif quality[point] == Quality.BAD:
+            elif quality[point] == Quality.BAD and point in unfilled:
                 quality[point] = Quality.GOOD

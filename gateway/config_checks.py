@@ -39,7 +39,7 @@ READ_KEYS: Final = ("on_failure", "stale_after", "events")
 CHANGE_KEYS: Final = ("whole", "expire")
 WRITE_KEYS: Final = ("trigger", *CHANGE_KEYS)
 LINE_LOAD_KEYS: Final = ("line", "framing", "baudrate", "parity", "data_bits", "stop_bits", "delay", "turnaround")
-POLL_LOAD_KEYS: Final = ("enabled", "unit", "function", "count", "every", "trigger")
+POLL_LOAD_KEYS: Final = ("enabled", "unit", "function", "address", "count", "every", "trigger")
 EVERYTHING_KNOWN: Final = Known()
 
 

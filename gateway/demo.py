@@ -260,7 +260,7 @@ class Demo:
     def setpoint_arrived(self) -> bool:
         """True if the boiler was given what SCADA wrote, once."""
         written = [values for _, address, values in tuple(self.boiler.writes) if address == SETPOINT]
-        return self.setpoint is not None and written == [[self.setpoint]]
+        return self.setpoint is not None and written.count([self.setpoint]) == 1
 
     def is_well(self) -> bool:
         """The verdict."""
@@ -304,8 +304,8 @@ and serves them as a slave (server) on 127.0.0.1:{port}, unit 1. Look at it your
   mbpoll -m tcp -p {port} -0 -t 4 -r 107 -c 4 127.0.0.1      boiler: 0.1 C, 110 is the setpoint
   mbpoll -m tcp -p {port} -0 -t 4 -r 110 127.0.0.1 700       give the boiler a setpoint of 70 C
 
-  python -c "from pymodbus.client import ModbusTcpClient as C; c = C('127.0.0.1', port={port}); c.connect();
-  print(c.read_input_registers(0, count=5).registers)"
+  python -c "from pymodbus.client import ModbusTcpClient as C; c = C('127.0.0.1', port={port}); c.connect(); \\
+print(c.read_input_registers(0, count=5).registers)"
 """
 
 

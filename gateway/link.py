@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import itertools
 import math
 import os
@@ -306,12 +307,32 @@ class SerialSettings:
         return (1 + self.data_bits + (self.parity != "none") + self.stop_bits) / self.baudrate
 
 
+class _ExclusivePort(serial.Serial):
+    """A port for this program alone: by pyserial's lock, and by the kernel for programs that ask for no lock.
+
+    Root opens it all the same. The kernel's word lasts until the last holder has closed the port, and so beyond us.
+    """
+
+    def open(self) -> None:
+        super().open()
+        self._tell_kernel(termios.TIOCEXCL)
+
+    def close(self) -> None:
+        if self.is_open:
+            self._tell_kernel(termios.TIOCNXCL)
+        super().close()
+
+    def _tell_kernel(self, request: int) -> None:
+        with contextlib.suppress(OSError):  # a driver without it, or a port that is gone
+            fcntl.ioctl(self.fileno(), request)
+
+
 def open_serial(settings: SerialSettings, waker: Waker, clock: Clock) -> Link:
     """Open the port for this program alone, set it up, and forget what had come before.
 
     raises: LinkUnavailable (missing, no permission, busy), LinkSettingRefused (it cannot do what is asked).
     """
-    port = serial.Serial(timeout=0, exclusive=True)  # opens with O_NONBLOCK: no wait for a carrier
+    port = _ExclusivePort(timeout=0, exclusive=True)  # opens with O_NONBLOCK: no wait for a carrier
     try:
         port.port = settings.device
         port.rts = settings.rs485 == "none"  # the kernel raises RTS at opening: drive an RS-485 pair no longer
@@ -339,13 +360,19 @@ def _set_rs485(port: serial.Serial, settings: SerialSettings) -> None:
     """Ask for the direction switching; comes before the format, which pyserial sets once more here."""
     try:
         if settings.rs485 == "kernel":
-            port.rs485_mode = RS485Settings(delay_before_tx=settings.rts_before_s, delay_before_rx=settings.rts_after_s)
+            before_s, after_s = _kernel_delay_s(settings.rts_before_s), _kernel_delay_s(settings.rts_after_s)
+            port.rs485_mode = RS485Settings(delay_before_tx=before_s, delay_before_rx=after_s)
         elif settings.rs485 == "rts":
             port.rts = False  # pyserial forgave a port without RTS at opening; here it shows
     except (OSError, ValueError) as error:
         what, other = ("RTS line", "kernel") if settings.rs485 == "rts" else ("kernel RS-485 mode", "rts")
         advice = f'use rs485 = "{other}" or an adapter that switches by itself'
         raise LinkSettingRefused(f"{settings.device} has no {what}; {advice}") from error
+
+
+def _kernel_delay_s(delay_s: float) -> float:
+    """*delay_s* in whole ms, rounded up; and half a ms more, which pyserial cuts off, but never a whole one."""
+    return (math.ceil(round(delay_s * 1000, 6)) + 0.5) / 1000
 
 
 def _set_format(fd: int, settings: SerialSettings) -> None:

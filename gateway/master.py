@@ -181,6 +181,8 @@ class Master:
             self._listen(line)
             return  # nothing is taken before it can be sent at once: a newer value may come meanwhile
         self._busy_since_s = None
+        if self.config.is_tcp:
+            line.advance(0.0)  # a device that has hung up after its last reply fails no request
         if self._carry_out_command(line) or self._carry_out_probe(line) or self._carry_out_poll(line):
             return
         line.advance(self._wait_s())
@@ -294,7 +296,8 @@ class Master:
         while self._line is line and not line.is_free and not self._stopping():
             self._alive()
             self._listen(line)
-        self._probes.spent(began_s, max(self._clock.monotonic(), began_s + PROBE_LEAST_S))
+        least_s = PROBE_LEAST_S if self._line is line else self.config.response_timeout  # a connection has its price
+        self._probes.spent(began_s, max(self._clock.monotonic(), began_s + least_s))
         return is_sent
 
     def _probe(self, line: Line, device: Device, is_wanted: bool) -> bool:

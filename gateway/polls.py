@@ -174,7 +174,7 @@ def _outlet(poll: Poll, requests: Sequence[RequestConfig]) -> Outlet:
         poll.source,
         on_change=config.trigger == "change",
         whole=config.whole,
-        commanded_only=config.trigger == "cycle" and filled_by_same_device,
+        commanded_only=(config.trigger == "cycle" or config.whole) and filled_by_same_device,
         expire_s=config.expire,
     )
 
@@ -231,8 +231,11 @@ class ProbeBudget:
         return sorted(ordered, key=lambda device: device not in wanted)
 
     def picked(self, device: Device, is_wanted: bool) -> None:
-        """*device* is probed now."""
-        self._last_unit, self._wanted_last = device.unit, is_wanted
+        """*device* is probed now; where it goes first because it is wanted, that is not its turn."""
+        goes_first = is_wanted and not self._wanted_last
+        if not goes_first:
+            self._last_unit = device.unit
+        self._wanted_last = goes_first
 
     def spent(self, began_s: float, free_s: float) -> None:
         """A probe took the line from *began_s* until it is free again at *free_s*, listening included.

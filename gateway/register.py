@@ -28,6 +28,8 @@ from gateway.modbus.pdu import Span, Table
 SIZE_DEFAULT: Final = 2000
 SIZE_MAX: Final = 65536
 NEVER_S: Final = -1.0  # time of last update of a point that was never written
+COMMANDED: Final = 1  # the upper side, a person or a retained value wrote it
+STAND_IN: Final = 2  # zero for a failed poll, not what the device has
 
 
 class Quality(IntEnum):
@@ -127,7 +129,7 @@ class _Points:
         self.quality = bytearray(size)
         self.time_s = array("d", [NEVER_S]) * size
         self.source: list[Source | None] = [None] * size
-        self.commanded = bytearray(size)  # 1 where the upper side, a person or a retained value wrote
+        self.commanded = bytearray(size)  # COMMANDED, STAND_IN, or 0
         self.held: dict[int, int] = {}  # point: how many commands are on their way to a device
         self.claims: list[Claim] = []
 
@@ -214,7 +216,7 @@ class DataRegister:
     def known(self, span: Span, commanded: bool = False) -> bytes | None:
         """Return the block, or None unless every point was written by someone.
 
-        commanded: at least one of them by the upper side, a person or a retained value.
+        commanded: at least one of them by the upper side, a person or a retained value, and no zero for a failed poll.
         """
         points = self._demand(span)
         with self._lock:
@@ -223,7 +225,8 @@ class DataRegister:
     @staticmethod
     def known_locked(points: _Points, span: Span, commanded: bool) -> bytes | None:
         """``known`` for whoever holds the lock already."""
-        if commanded and not any(points.commanded[span.start : span.stop]):
+        marks = points.commanded[span.start : span.stop]
+        if commanded and (COMMANDED not in marks or STAND_IN in marks):
             return None
         return points.wire(span.start, span.stop) if min(points.time_s[span.start : span.stop]) > NEVER_S else None
 
@@ -248,11 +251,12 @@ class DataRegister:
     def mask_write(self, span: Span, and_mask: int, or_mask: int, source: Source) -> None:
         """Change one register as function 22 does, in one step.
 
-        raises: as ``write`` does; PointUnknown where a value that nobody wrote would go to a device.
+        raises: as ``write`` does; PointUnknown where a value that nobody knows would go to a device.
         """
         points = self._demand(span)
         with self._lock:
-            if points.time_s[span.start] == NEVER_S and any(sink.wants(span) for sink in self._sinks):
+            is_unknown = points.time_s[span.start] == NEVER_S or points.commanded[span.start] == STAND_IN
+            if is_unknown and any(sink.wants(span) for sink in self._sinks):
                 raise PointUnknown(f"nobody knows point {span.start} yet: a part of it cannot be sent to its device")
             old = int.from_bytes(points.wire(span.start, span.stop), "big")
             raw = (old & and_mask | or_mask & ~and_mask & 0xFFFF).to_bytes(2, "big")
@@ -360,9 +364,11 @@ class DataRegister:
             points.time_s[start:stop] = array("d", [now_s]) * count
         points.source[start:stop] = [source] * count
         if source.kind is not SourceKind.REQUEST:
-            points.commanded[start:stop] = b"\x01" * count
+            points.commanded[start:stop] = bytes([COMMANDED]) * count
         elif is_stand_in:  # nobody wanted them written anywhere
-            points.commanded[start:stop] = bytes(count)
+            points.commanded[start:stop] = bytes([STAND_IN]) * count
+        elif STAND_IN in points.commanded[start:stop]:
+            points.commanded[start:stop] = points.commanded[start:stop].replace(bytes([STAND_IN]), b"\0")
         if self._watchers:
             self._untold.append(Written(span, points.wire(start, stop), source, quality))
 

@@ -220,9 +220,12 @@ SCADA = Source(SourceKind.CLIENT, "scada 10.0.0.5:40232")
 
 
 class LosableLink(ScriptedLink):
-    """A ScriptedLink that is lost, once, at the next read or write after *lose* is set."""
+    """A ScriptedLink that is lost, once, at the next read or write after *lose* is set.
 
-    lose: str = ""  # "read", "write" or ""
+    "idle": the other side has hung up, which even a read that does not wait finds out.
+    """
+
+    lose: str = ""  # "read", "write", "idle" or ""
 
     def _lose_at(self, what: str) -> None:
         if self.lose == what:
@@ -234,6 +237,7 @@ class LosableLink(ScriptedLink):
         super().write(data)
 
     def read(self, timeout_s: float) -> bytes:
+        self._lose_at("idle")
         if timeout_s > 0:
             self._lose_at("read")
         return super().read(timeout_s)

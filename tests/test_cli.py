@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -39,9 +40,23 @@ unit = 1
 """
 
 
-def rtugate(*arguments: str, timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
+HERE = Path(__file__).parent.parent
+
+
+def rtugate(
+    *arguments: str, timeout_s: float = 30.0, cwd: Path = HERE, **environment: str
+) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "gateway", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+    known = os.environ | {"PYTHONPATH": str(HERE)} | environment
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=timeout_s, check=False, cwd=cwd, env=known, errors="replace"
+    )
+
+
+def shell(arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run `rtugate` with a shell's redirections."""
+    command, known = f"{sys.executable} -m gateway {arguments}", os.environ | environment
+    return subprocess.run(command, shell=True, capture_output=True, text=True, timeout=30, check=False, env=known)  # noqa: S602 - redirections are what is tested
 
 
 @contextmanager
@@ -114,9 +129,72 @@ def test_check_warns_of_a_line_that_cannot_keep_up(file: Path) -> None:
     assert "% of the line" in checked.stdout
 
 
+def test_a_file_that_may_not_be_looked_at_is_no_usage_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(self: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "stat", refused)  # as root, nothing would refuse
+    assert main(["check", "/secret/a.toml"]) == 1
+    assert capsys.readouterr().err == "a.toml: cannot be read: Permission denied\n"
+
+
+def test_check_never_shows_a_traceback_whatever_the_file_is_called(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    said = {name: rtugate("check", name, cwd=tmp_path) for name in ("x" * 300, "fifo", "/dev/zero", ".", "")}
+    assert [ended.returncode for ended in said.values()] == [1] * 5
+    assert [ended.stderr for ended in said.values()] == [
+        f"{'x' * 255}...: cannot be read: File name too long\n",
+        "fifo: is not a regular file\n",
+        "zero: is not a regular file\n",
+        ".: cannot be read: Is a directory\n",
+        ".: cannot be read: Is a directory\n",
+    ]
+    assert main(["check", "a\0b"]) == 2
+
+
+def test_file_names_are_shown_without_control_characters(tmp_path: Path) -> None:
+    name = b"a\x1b[31m\n\xff"
+    for content, code in (("", 0), ("x = 1", 1)):
+        Path(os.fsdecode(bytes(tmp_path) + b"/" + name)).write_text(content)
+        ended = rtugate("check", os.fsdecode(name), cwd=tmp_path)
+        assert ended.returncode == code
+        assert (ended.stdout + ended.stderr).startswith("a\\x1b[31m\\n\\udcff:")
+    assert rtugate("check", "no\x1b", cwd=tmp_path).stderr == "rtugate: no\\x1b: no such file\n"
+
+
+def test_a_letter_that_the_terminal_does_not_know_is_no_error(tmp_path: Path) -> None:
+    (tmp_path / "é.toml").touch()
+    ended = rtugate("check", "é.toml", cwd=tmp_path, PYTHONIOENCODING="ascii")
+    assert (ended.returncode, ended.stdout) == (0, "\\xe9.toml: valid\n")
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_full_disk_behind_the_output_is_one_line(file: Path, unbuffered: str) -> None:
+    ended = shell(f"check {file} >/dev/full", PYTHONUNBUFFERED=unbuffered)
+    assert ended.returncode == 1
+    assert ended.stderr == "rtugate: the output cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        ("check {} 2>/dev/full", 0),
+        ("check {} >/dev/full 2>/dev/full", 1),
+        ("check {}.no 2>/dev/full", 2),
+        ("run -c {}.no 2>/dev/full", 2),
+        ("check {} >&-", 0),
+        ("check {}.no >&- 2>&-", 2),
+    ],
+)
+def test_where_nothing_can_be_written_the_exit_code_says_it(file: Path, arguments: str, code: int) -> None:
+    ended = shell(arguments.format(file))
+    assert (ended.returncode, ended.stderr) == (code, "")
+
+
 def test_output_into_a_closed_pipe_is_no_traceback(file: Path) -> None:
-    command = f"{sys.executable} -m gateway check {file} | true"
-    ended = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=30, check=False)  # noqa: S602 - a shell's pipe is what is tested
+    ended = shell(f"check {file} | true")
     assert "Traceback" not in ended.stderr
 
 
@@ -140,6 +218,24 @@ def test_wrong_usage_is_exit_code_2(arguments: tuple[str, ...]) -> None:
     assert ended.returncode == 2
     assert ended.stdout == ""
     assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("-c", "{}", "check"),
+        ("check", "-c", "{}"),
+        ("-c", "no.toml", "check", "-c", "{}"),
+        ("-c", "no.toml", "-c", "{}", "--state", "a", "check", "--state", "b"),
+        ("check", "-c", "no.toml", "-c", "{}"),
+        ("-c", "no.toml", "check", "{}"),
+    ],
+)
+def test_file_and_state_stand_before_or_behind_the_command_and_the_last_counts(
+    file: Path, arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([argument.format(file) for argument in arguments]) == 0
+    assert capsys.readouterr().out.startswith(f"{file}: valid\n")
 
 
 def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
@@ -188,6 +284,16 @@ def test_run_never_refuses_to_start_because_of_a_bad_file(file: Path) -> None:
     with running("run", "-c", str(file)) as process:
         said = wait_for_line(process, "factory settings")
         assert "rtugate.toml:2:" in said
+        process.terminate()
+        assert process.wait(timeout=2.0) == 0
+
+
+@pytest.mark.parametrize("name", ["fifo", ".", "x" * 300])
+def test_run_goes_on_without_what_is_no_file(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    with running("run", "-c", str(tmp_path / name)) as process:
+        wait_for_line(process, "factory settings")
+        wait_for_line(process, "runs:")
         process.terminate()
         assert process.wait(timeout=2.0) == 0
 

@@ -53,25 +53,15 @@ def test_keys_of_the_other_kind_may_stand_at_their_default() -> None:
     assert said(with_requests({"function": 6, "count": 1, "on_failure": "hold"})) == []
 
 
-@pytest.mark.parametrize(
-    ("function", "address", "hint"),
-    [
-        (2, 10001, "for discrete input 10001 type address = 0"),
-        (4, 30010, "for input register 30010 type address = 9"),
-        (16, 49999, "for holding register 49999 type address = 9998"),
-        (3, 40000, None),
-        (3, 50000, None),
-        (3, 30001, None),
-        (1, 10001, None),
-    ],
-)
-def test_an_address_that_looks_like_a_reference_number_is_a_warning(
-    function: int, address: int, hint: str | None
-) -> None:
-    config, found = validate(with_requests({"function": function, "address": address}))
-    assert config is not None
-    assert [one.severity for one in found] == ["warning"] * bool(hint)
-    assert all(hint and one.message.endswith(hint) for one in found)
+@pytest.mark.parametrize(("key", "value"), [("whole", True), ("expire", 5)])
+def test_keys_for_writes_on_change_are_refused_on_a_cyclic_write(key: str, value: object) -> None:
+    text = f'{key} is for writes on change, and this one writes every cycle: trigger = "change" is missing'
+    assert validate(with_requests({"function": 16, key: value}))[1] == [Finding(("master", 0, "request", 0, key), text)]
+    assert said(with_requests({"function": 16, "trigger": "change", key: value})) == []
+
+
+def test_an_address_in_a_model_has_no_spelling_and_is_taken_as_it_is() -> None:
+    assert said(with_requests({"address": 40108})) == []
 
 
 def test_a_name_belongs_to_one_master_slave_or_input() -> None:
@@ -234,6 +224,29 @@ def test_the_event_block_is_not_filled_by_a_read() -> None:
     ]
 
 
+@pytest.mark.parametrize("address", [0, 1, 1999, 2000, 65535])
+def test_the_fifo_is_an_address_and_no_point(address: int) -> None:
+    assert said(with_requests({}) | {"events": {"fifo_point": address}}) == []
+
+
+@pytest.mark.parametrize("events", [{}, {"size": 5}, {"fifo_point": -1, "block_point": -1}])
+def test_changes_that_nobody_can_take_are_a_warning(events: dict[str, int]) -> None:
+    text = "nobody can take the changes: set fifo_point or block_point in [events]"
+    config, found = validate(with_requests({"events": True}) | {"events": events})
+    assert config is not None
+    assert found == [Finding(("master", 0, "request", 0, "events"), text, "warning")]
+
+
+@pytest.mark.parametrize("events", [{"fifo_point": 0}, {"block_point": 100}])
+def test_changes_are_taken_by_function_24_or_from_the_block(events: dict[str, int]) -> None:
+    assert said(with_requests({"events": True}) | {"events": events}) == []
+
+
+def test_an_overlap_is_judged_by_the_count_that_the_function_allows() -> None:
+    found = said(with_requests({"count": 200, "point": 0}, {"name": "next", "point": 125}))
+    assert found == ["count 200 is more than 125"]
+
+
 # --- access
 
 
@@ -255,35 +268,7 @@ def test_a_wifly_line_needs_a_password() -> None:
     assert found == ["line /dev/ttyS0: a menu over WiFi needs a password: `rtugate passwd` sets one"]
 
 
-# --- all at once
-
-
-def test_errors_of_fields_and_of_what_does_not_fit_come_together() -> None:
-    data = with_requests({"unit": "x"}, {"count": 126, "point": 50}, {"name": "a", "point": 60, "address": 0})
-    data["master"].insert(0, {"name": "broken"})
-    data["slave"] = [{"name": "bad"}, SLAVE | {"name": "field"}]
-    data["log"] = {"level": 1}
-    paths = {finding.path for finding in validate(data)[1]}
-    assert paths == {
-        ("master", 0, "line"),
-        ("master", 1, "request", 0, "unit"),
-        ("master", 1, "request", 1, "count"),
-        ("master", 1, "request", 2, "point"),  # overlaps request 1
-        ("slave", 0, "line"),
-        ("slave", 0, "unit"),
-        ("slave", 1, "name"),
-        ("log", "level"),
-    }
-
-
-def test_defaults_in_the_place_of_a_wrong_table_are_not_judged() -> None:
-    data = {"slave": [SLAVE | {"line": "tcp://0.0.0.0:2323"}], "hmi": {"password": 1, "telnet": {"listen": ""}}}
-    assert said(data) == ["password *** is not a text: put it in quotes"]
-
-
-def test_without_table_sizes_points_are_not_judged() -> None:
-    data = with_requests({"point": 5000}) | {"register": {"holding_registers": "10000"}}
-    assert said(data) == ['holding_registers "10000" is not a whole number']
+# --- warnings
 
 
 def test_warnings_and_notes_do_not_stop_a_configuration() -> None:

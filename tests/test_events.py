@@ -38,7 +38,7 @@ HEAD, ENTRY = 3, 7
 
 
 def a_queue(
-    register: DataRegister, clock: JumpingClock, size: int = 1000, block: Span | None = None, fifo: int | None = FIFO
+    register: DataRegister, clock: JumpingClock, size: int = 10_000, block: Span | None = None, fifo: int | None = FIFO
 ) -> EventQueue:
     return EventQueue(register, clock, MARKED, size, fifo, block)
 
@@ -67,9 +67,11 @@ def changes_to(register: DataRegister, *values: int) -> None:
 
 
 def taken(queue: EventQueue) -> list[list[int]]:
-    """All entries, taken out by function 24."""
+    """All entries, taken out by function 24, which has to say rightly how many waited."""
     entries: list[list[int]] = []
     while (found := queue.read_fifo(FIFO)) is not None and len(found) > 2:
+        assert len(found) == 2 + ENTRY * min(4, found[0])
+        assert found[-ENTRY:] not in entries[-1:], "what was taken is still there"
         entries += entries_of(found[2:])
     return entries
 
@@ -521,7 +523,7 @@ def test_without_a_block_nothing_is_written(register: DataRegister, queue: Event
 
 
 WRITERS: Final = 4
-VALUES: Final = 150  # each writer's
+VALUES: Final = 1000  # each writer's
 WIDE: Final = Span(HOLDING, 100, 3 + 7 * 17)
 
 
@@ -539,7 +541,7 @@ def a_writer(register: DataRegister, point: int) -> Callable[[], None]:
 
     def write() -> None:
         for value in range(VALUES + 1):
-            poll(register, point, point << 8 | value)
+            poll(register, point, point << 10 | value)
 
     return write
 
@@ -581,8 +583,30 @@ def assert_whole(entries: list[list[int]]) -> None:
     assert [found[0] for found in entries] == list(range(1, WRITERS * VALUES + 1))
     for point in range(10, 10 + WRITERS):
         values = [found[3:] for found in entries if found[2] == point]
-        assert values == [[point << 8 | value, *AT_START] for value in range(1, VALUES + 1)]
+        assert values == [[point << 10 | value, *AT_START] for value in range(1, VALUES + 1)]
     assert {found[1] for found in entries} == {3}
+
+
+class InterruptedRegister(DataRegister):
+    """A register with a moment for *meanwhile*, once, between the making and the writing of a block."""
+
+    meanwhile: Callable[[], object] | None = None
+
+    def write(self, span: Span, data: bytes, source: Source, quality: Quality = Quality.GOOD) -> None:
+        if span == BLOCK and self.meanwhile is not None:
+            meanwhile, self.meanwhile = self.meanwhile, None
+            meanwhile()
+        super().write(span, data, source, quality)
+
+
+def test_a_block_that_is_old_before_it_is_written_is_written_anew(clock: JumpingClock) -> None:
+    register = InterruptedRegister(clock)
+    queue = a_queue(register, clock, block=BLOCK)
+    changes_to(register, 1, 2, 3, 4)
+    register.meanwhile = lambda: queue.read_fifo(FIFO)
+    poll(register, 10, 5)  # the block that shows 1 and 2 is written after function 24 took both
+    assert register.meanwhile is None
+    assert block_of(register) == [0, 1, 0, *entry(5, 5), *NO_ENTRY]
 
 
 @pytest.mark.usefixtures("quick_switching")
@@ -615,11 +639,12 @@ class BlockReader:
         self._register = register
         self.entries: list[list[int]] = []
 
-    def take(self) -> None:
-        """Take until nothing waits."""
-        while self.read():
-            if self.entries:
-                poll(self._register, WIDE.start, self.entries[-1][0], source=SCADA)
+    def take(self) -> int:
+        """Take what the block shows; return how many changes waited."""
+        waiting = self.read()
+        if waiting:
+            poll(self._register, WIDE.start, self.entries[-1][0], source=SCADA)
+        return waiting
 
     def read(self) -> int:
         """Keep what is new in the block, and return how many changes wait."""
@@ -636,7 +661,7 @@ def whole_block(register: DataRegister) -> tuple[int, list[list[int]]]:
     count = min(waiting, 17)
     assert entries[count:] == [NO_ENTRY] * (17 - count)
     for number, table, point, value, *time in entries[:count]:
-        assert (table, time, value >> 8) == (3, AT_START, point), f"change {number} is torn"
+        assert (table, time, value >> 10) == (3, AT_START, point), f"change {number} is torn"
     numbers = [each[0] for each in entries[:count]]
     assert numbers == list(range(numbers[0], numbers[0] + count)) if numbers else count == 0
     assert lost == 0
@@ -650,6 +675,9 @@ def test_scada_at_the_block_gets_each_change_once_and_never_half_of_one(
     queue = a_queue(register, clock, block=WIDE, fifo=None)
     scada = BlockReader(register)
     while_writing(register, scada.take)
+    for _ in range(WRITERS * VALUES):  # nobody writes any more: each turn takes 17
+        if not scada.take():
+            break
     assert_whole(scada.entries)
     assert (queue.waiting, queue.lost) == (0, 0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import time
 import tomllib
 from pathlib import Path
@@ -82,12 +83,18 @@ rtugate.toml:7: master "field": unknown key "bauderate"; did you mean "baudrate"
 rtugate.toml:9: master "field", request "boiler": unit is missing: 1 to 247
 rtugate.toml:19: note: master "roof": 8N1 is accepted; without parity the standard asks for stop_bits = 2
 rtugate.toml:23: master "roof", request "fan": unit 248 is more than 247
-rtugate.toml:25: warning: master "roof", request "fan": address 40001 looks like a reference number: \
-for holding register 40001 type address = 0
+rtugate.toml:25: master "roof", request "fan": address 40001 looks like a reference number: \
+for holding register 40001 type address = 0; if PDU address 40001 is really meant, type 0x9C41
 rtugate.toml:26: master "roof", request "fan": count 126 is more than 125
 rtugate.toml:30: master 3: name "three words here" is no name: 1 to 32 letters, digits, - and _
+rtugate.toml:33: master 3, request 1: \
+point 0: point 0 of holding-registers is already filled by master "field", request "boiler"
 rtugate.toml:34: master 3, request 2: count is missing: how many, 1 to the function's limit
+rtugate.toml:34: master 3, request 2: another request is called "u1-f3-0" too: give one of them a name
+rtugate.toml:34: master 3, request 2: \
+point 0: point 0 of holding-registers is already filled by master "field", request "boiler"
 rtugate.toml:35: master 3, request 3: point 70000 is more than 65535
+rtugate.toml:35: master 3, request 3: another request is called "u1-f3-0" too: give one of them a name
 rtugate.toml:44: slave "scada": allow "192.168.1.5/24" is an address inside a network: the network is 192.168.1.0/24
 rtugate.toml:48: [hmi.telnet]: listen "here" is not host:port, with a port from 1 to 65535
 rtugate.toml:51: [log]: level "loud" is not one of "debug", "info", "warning", "error"
@@ -162,6 +169,92 @@ def test_nesting_that_exhausts_the_parser_is_an_error_too(monkeypatch: pytest.Mo
     assert errors_of("a = " + "[" * 5000 + "]" * 5000) == ["rtugate.toml: nested too deep"]
 
 
+# --- reference numbers
+
+
+def with_address(address: str, function: object = 3, more: str = "") -> str:
+    return (
+        "[[master]]\nname = 'field'\nline = '/dev/ttyS2'\n[[master.request]]\nunit = 17\n"
+        f"address = {address}  # 40001 to 49999 is a handbook's way to count\n"
+        f"function = {function!r}\ncount = 1\npoint = 0\n{more}"
+    )
+
+
+def confused(number: int, kind: str, address: int, spelled: str) -> str:
+    return (
+        f'rtugate.toml:6: master "field", request 1: address {number} looks like a reference number: '
+        f"for {kind} {number} type address = {address}; if PDU address {number} is really meant, type {spelled}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("spelling", "function", "message"),
+    [
+        ("40108", 3, confused(40108, "holding register", 107, "0x9CAC")),
+        ("40_108", "read_holding_registers", confused(40108, "holding register", 107, "0x9CAC")),
+        ("+40001", 6, confused(40001, "holding register", 0, "0x9C41")),
+        ("49999", "write-multiple-registers", confused(49999, "holding register", 9998, "0xC34F")),
+        ("30010", 4, confused(30010, "input register", 9, "0x753A")),
+        ("10001", 2, confused(10001, "discrete input", 0, "0x2711")),
+    ],
+)
+def test_an_address_spelled_like_a_reference_number_is_an_error(spelling: str, function: object, message: str) -> None:
+    assert errors_of(with_address(spelling, function)) == [message]
+
+
+@pytest.mark.parametrize(
+    ("spelling", "function"),
+    [
+        ("0x9CAC", 3),  # as devices with SunSpec's registers have it
+        ("0x9c_ac", 3),
+        ("0o116254", 3),
+        ("0b1001110010101100", 16),
+        ("40000", 3),
+        ("50000", 3),
+        ("30001", 3),
+        ("40001", 4),
+        ("10001", 1),
+        ("10001", 15),
+        ("10000", 2),
+        ("20000", 2),
+    ],
+)
+def test_any_other_spelling_or_number_is_taken_as_it_is(spelling: str, function: object) -> None:
+    loaded = load_text(with_address(spelling, function), "rtugate.toml")
+    assert loaded.config.master[0].request[0].address == int(spelling, 0)
+    assert loaded.findings == []
+
+
+def test_a_reference_number_is_found_next_to_other_errors_and_in_inline_tables() -> None:
+    assert errors_of(with_address("40108", more="every = 0\n"))[0] == confused(40108, "holding register", 107, "0x9CAC")
+    request = "{unit = 1, function = 3, 'address' = 40108, count = 1, point = 0}"
+    inline = f"master = [{{name = 'a', line = '/dev/ttyS2', request = [\n{request}]}}]"
+    assert [line.partition(" looks")[0] for line in errors_of(inline)] == [
+        'rtugate.toml:2: master "a", request 1: address 40108'
+    ]
+
+
+@pytest.mark.parametrize("function", ["none", [3], True, 3.0, 7])
+def test_without_a_function_a_reference_number_cannot_be_told(function: object) -> None:
+    text = with_address("40108", function).replace("True", "true")
+    assert not any("reference" in line for line in errors_of(text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[master.a.request.b]\naddress = 40108\n",
+        "[[master]]\n[[master.request]]\naddress.x = 40108\n",
+        "[[master]]\n[[master.request]]\naddress = [40108]\n",
+        "[[master]]\n[[master.request]]\naddress = 40108-01-01\n",
+        "[[master.request]]\naddress = 40108\nfunction = 3\n",
+        "master = [[{request = [{address = 40108}]}]]\n",
+    ],
+)
+def test_an_address_in_a_wrong_place_is_an_error_like_any_other(text: str) -> None:
+    assert not any("reference" in line for line in errors_of(text))
+
+
 # --- files
 
 
@@ -192,8 +285,33 @@ def test_a_file_without_permission_says_so(tmp_path: Path) -> None:
     assert errors_of_file(path) == "secret.toml: cannot be read: Permission denied"
 
 
-def test_a_file_without_end_is_not_read_to_its_end() -> None:
-    assert errors_of_file(Path("/dev/zero")) == "zero: is larger than 1 MiB"
+def test_a_file_that_is_too_large_is_not_read_to_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "large.toml"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # a hole: takes no room
+    assert errors_of_file(path) == "large.toml: is larger than 1 MiB"
+
+
+def test_what_is_no_file_is_refused_unopened(tmp_path: Path) -> None:
+    fifo = tmp_path / "fifo.toml"
+    os.mkfifo(fifo)  # to open it would wait for a writer
+    assert errors_of_file(fifo) == "fifo.toml: is not a regular file"
+    assert errors_of_file(Path("/dev/zero")) == "zero: is not a regular file"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "s"))
+        assert errors_of_file(tmp_path / "s") == "s: is not a regular file"
+
+
+def test_a_name_that_is_too_long_says_so() -> None:
+    assert errors_of_file(Path("x" * 300)) == f"{'x' * 255}...: cannot be read: File name too long"
+
+
+def test_a_folder_without_a_name_is_named() -> None:
+    assert errors_of_file(Path()) == ".: cannot be read: Is a directory"
+
+
+def test_a_file_name_is_shown_without_control_characters() -> None:
+    assert str(LocatedFinding("a\x1b[31m\n\udcff.toml", 2, "", "is wrong")) == "a\\x1b[31m\\n\\udcff.toml:2: is wrong"
 
 
 # --- whatever stands in it

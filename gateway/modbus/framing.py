@@ -28,6 +28,7 @@ TCP_LENGTH_MIN: Final = 2  # unit and function
 TCP_LENGTH_MAX: Final = 254  # unit and 253 bytes of PDU
 NOISE_MAX: Final = 2  # bytes that a turning RS-485 driver may put before a frame
 HELD_MAX: Final = 4096  # bytes kept of a stream that makes no sense
+FALSE_STARTS_MAX: Final = 128  # looked behind while one reply is awaited; each may cost the CRC of a long frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +244,8 @@ class RtuReplyFramer:
     """One reply, as a master waits for it (spec section 2).
 
     Bytes before the awaited unit are dropped; then comes the function, or it with the top bit set; then as many
-    bytes as the function implies; then the CRC. Where that fails, the search goes on one byte later.
+    bytes as the function implies; then the CRC. Where that fails, the search goes on one byte later; not for ever:
+    after ``FALSE_STARTS_MAX`` the line talks nonsense, and all that comes is dropped until ``expect``.
     """
 
     def __init__(self) -> None:
@@ -251,6 +253,7 @@ class RtuReplyFramer:
         self._held = bytearray()
         self._unit = -1
         self._function = -1
+        self._false_starts = 0
 
     broken = False
 
@@ -264,6 +267,7 @@ class RtuReplyFramer:
     def expect(self, unit: int, function: int) -> None:
         self._held.clear()
         self._unit, self._function = unit, function
+        self._false_starts = 0
 
     def receive_data(self, data: bytes) -> None:
         self._held += data
@@ -291,11 +295,14 @@ class RtuReplyFramer:
 
     def _give_up_start(self) -> None:
         self.damaged += 1
-        del self._held[0]
+        self._false_starts += 1
+        del self._held[: 1 if self._false_starts < FALSE_STARTS_MAX else None]
 
     def _to_next_start(self) -> bool:
         """Drop bytes up to the awaited unit and function; True if both are there."""
         held = self._held
+        if self._false_starts >= FALSE_STARTS_MAX:
+            held.clear()
         while held:
             start = held.find(self._unit) if self._unit >= 0 else -1
             del held[: start if start >= 0 else len(held)]

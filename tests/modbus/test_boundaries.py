@@ -481,10 +481,11 @@ def test_pymodbus_reads_the_same_out_of_the_replies(points: int) -> None:
     rows = rows_with(points, {1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43})  # 24: pymodbus 3.8.6 loses registers of it
     wellformed = [row for row in rows if not row.is_refused or (row.reply[2:] == "02" and row.function != 5)]
     bench = bench_with(points)
-    with serving_tcp(tcp_config(), bench.register) as served, peers.client_tcp(served.port) as client:
+    wrong: list[str] = []
+    with serving_tcp(tcp_config(), bench.register) as served:
         serve_all(served.task.server)
-        wrong = []
-        for row in wellformed:
-            wrong += [] if is_what_pymodbus_found(row, asked_by_pymodbus(client, row)) else [str(row)]
-            wrong += bench.check_state(row)
+        with peers.client_tcp(served.port) as client:
+            for row in wellformed:
+                wrong += [] if is_what_pymodbus_found(row, asked_by_pymodbus(client, row)) else [str(row)]
+                wrong += bench.check_state(row)
     assert not wrong, "\n".join(wrong)
