@@ -33,7 +33,7 @@ check: $(VENV)/.check
 bench: $(VENV)/.test
 	$(BIN)/python -m bench.run
 
-system-test: $(VENV)/.test
+system-test: $(VENV)/.system
 	$(BIN)/python -m tests.system.run
 
 $(VENV)/bin/python:
@@ -46,6 +46,10 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 
 $(VENV)/.check: $(VENV)/.test
 	$(INSTALL) -e '.[test,check]'
+	touch $@
+
+$(VENV)/.system: $(VENV)/.test
+	$(INSTALL) -e '.[test,system]'
 	touch $@
 
 clean:

@@ -20,7 +20,7 @@ from itertools import islice
 from typing import Final
 
 from gateway.clock import Clock
-from gateway.config import EVENT_ENTRY
+from gateway.config import EVENT_BLOCK_ENTRIES, EVENT_ENTRY
 from gateway.modbus.pdu import Span, Table, bit_at, pack_words, word_at
 from gateway.register import DataRegister, Source, SourceKind, Written
 
@@ -99,10 +99,10 @@ class EventQueue:
         return head + [number for change in taken for number in change.registers]
 
     def acknowledge(self, sequence: int) -> None:
-        """SCADA has taken everything up to *sequence*; one that does not wait is no news."""
+        """SCADA has taken everything up to *sequence*; one that the block does not show is no news."""
         with self._lock:
             self._acknowledged = sequence
-            if sequence in [change.sequence for change in self._changes]:
+            if sequence in [change.sequence for change in islice(self._changes, EVENT_BLOCK_ENTRIES)]:
                 while self._changes.popleft().sequence != sequence:
                     pass
         self._show()

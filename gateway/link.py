@@ -318,8 +318,7 @@ class _ExclusivePort(serial.Serial):
         self._tell_kernel(termios.TIOCEXCL)
 
     def close(self) -> None:
-        if self.is_open:
-            self._tell_kernel(termios.TIOCNXCL)
+        self._tell_kernel(termios.TIOCNXCL)
         super().close()
 
     def _tell_kernel(self, request: int) -> None:

@@ -132,6 +132,7 @@ class SerialSlave:
             self._framer.receive_data(data)
             self._heard_s, self._is_talk = now_s, True
             if self.config.framing_used == "ascii":
+                self._framer.receive_data(link.read(0.0))  # after a wait for the processor, what was read may be stale
                 self._answer_burst(link)
         elif self._is_talk and now_s >= self._heard_s + self._silence_s:
             self._is_talk = False

@@ -204,6 +204,17 @@ def test_discard_counts_what_it_throws_away(pty: Pty, line: DescriptorLink) -> N
     assert line.read(0) == b""
 
 
+def test_a_write_to_a_port_that_takes_nothing_gives_up_after_a_second(line: DescriptorLink) -> None:
+    """Nobody reads at the other end of the pty; the kernel takes some, then nothing more."""
+    data = bytes(100_000)
+    limit_s = len(data) * line.character_s
+    line.character_s = 0.0  # the time of the characters themselves is not what this is about
+    started = CLOCK.monotonic()
+    with pytest.raises(LinkLost, match="does not take data"):
+        line.write(data)
+    assert 0.9 <= CLOCK.monotonic() - started < 1.0 + limit_s
+
+
 def test_the_limit_of_a_write_ends_even_if_time_jumps(pty: Pty, line: DescriptorLink) -> None:
     line.write_grace_s = -1000.0
     with pytest.raises(LinkLost, match="does not take data"):

@@ -287,6 +287,21 @@ def test_a_state_is_told_in_words(clock: JumpingClock) -> None:
     assert it.master.state() == "idle"
 
 
+def test_a_line_has_an_alarm_while_a_device_is_offline_or_the_port_is_gone(clock: JumpingClock) -> None:
+    it = MasterBench(clock, reads(1, 0), reads(2, 1))
+    it.run_s(2.0)
+    assert not it.master.has_alarm
+    it.field.silent = {1}
+    it.run_s(60.0)
+    assert it.master.has_alarm
+    it.field.silent = set()
+    it.run_s(120.0)
+    assert not it.master.has_alarm
+    it.link.lose, it.missing = "read", LinkUnavailable("/dev/ttyS2 is not there")
+    it.run_s(5.0)
+    assert it.master.has_alarm
+
+
 def test_run_polls_until_it_is_stopped_and_lets_go_of_everything(clock: JumpingClock) -> None:
     it = MasterBench(clock, reads(1, 0), writes(1, 10))
     stop = threading.Event()

@@ -20,6 +20,7 @@ from gateway.modbus.pdu import EXCEPTION_BIT, PDU_MAX, REPLY_SHAPES, REQUEST_SHA
 
 Framing = Literal["rtu", "ascii", "tcp"]
 
+UNIT_MAX: Final = 247  # serial line guide, section 2.2; above is reserved
 RTU_MIN: Final = 4  # unit, function, CRC
 RTU_MAX: Final = 256  # serial line guide, section 2.5.1.1
 ASCII_MAX: Final = 513  # section 2.5.2.1: colon, 2 x 255, CR LF
@@ -138,8 +139,9 @@ class RtuRequestFramer:
     has come by then is read from its start, frame by frame; the CRC tells a request from a reply where both have the
     same function. Where that does not come out even: the whole may be one frame (functions whose length only silence
     tells, requests that are too long or too short), or its end may be one. What makes no sense is kept, because more
-    of it may come, until ``reset()``; or until a whole request stands at its end. A byte or two of noise before a
-    request may look like the start of something longer, and count as damage, too.
+    of it may come, until ``reset()``; or until a whole request stands at its end, or all since the last silence is a
+    frame. A byte or two of noise before a request may look like the start of something longer, and count as damage,
+    too.
     """
 
     def __init__(self) -> None:
@@ -147,6 +149,7 @@ class RtuRequestFramer:
         self._held = bytearray()
         self._frames: deque[Frame] = deque()
         self._is_counted = False  # what is held has been counted as damaged
+        self._burst = 0  # where in what is held began what has come since the last silence
 
     broken = False
 
@@ -165,6 +168,7 @@ class RtuRequestFramer:
         if len(self._held) > HELD_MAX:  # a line that never rests: nothing in it can be for us
             self.damaged += 1
             del self._held[:-RTU_MAX]
+            self._burst = 0
 
     def next_frame(self) -> Frame | None:
         return self._frames.popleft() if self._frames else None
@@ -181,15 +185,16 @@ class RtuRequestFramer:
             frames.append(_cut(held, position, len(held)))
             rest = 0
         elif rest:
-            latest = len(held) if self._is_lost(position) else position + NOISE_MAX
-            last = self._last_frame(position, latest)
-            if last or (latest == len(held) and self._ends(position)):
+            is_lost = self._is_lost(position)
+            last = self._last_frame(position, len(held) if is_lost else position + NOISE_MAX)
+            if last or (is_lost and self._ends(position)):
                 self._count_damage()
             if last:
                 frames += last
                 rest = 0
         del held[: len(held) - rest]
         self._is_counted &= rest > 0
+        self._burst = rest
         self._frames += frames
 
     def reset(self) -> None:
@@ -197,6 +202,7 @@ class RtuRequestFramer:
             self._count_damage()
         self._held.clear()
         self._is_counted = False
+        self._burst = 0
 
     def _count_damage(self) -> None:
         """What is held is damaged: that counts once, however long it is held."""
@@ -223,11 +229,16 @@ class RtuRequestFramer:
         return all(stop <= len(self._held) for stop in self._ends(start))  # also where only silence tells the end
 
     def _last_frame(self, start: int, latest: int) -> list[Frame]:
-        """The request at the very end of what has come, begun after *start* and not after *latest*; else nothing."""
+        """The request at the very end of what has come, begun after *start* and not after *latest*; else nothing.
+
+        What silence encloses may be any frame of a unit that there can be: FF FF 00 00, say, is noise with a right CRC.
+        """
         held = self._held
         for first in range(max(start + 1, len(held) - RTU_MAX), min(latest, len(held) - RTU_MIN) + 1):
             length = pdu_length(REQUEST_SHAPES, held[first + 1 :])
-            if length and first + 1 + length + 2 == len(held) and _is_frame(held, first):
+            is_request = length and first + 1 + length + 2 == len(held)
+            is_burst = first == self._burst and held[first] <= UNIT_MAX
+            if (is_request or is_burst) and _is_frame(held, first):
                 return [_cut(held, first, len(held))]
         return []
 

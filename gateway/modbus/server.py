@@ -94,6 +94,8 @@ def answer(request: bytes, server: Server, broadcast: bool = False) -> bytes:
     try:
         if line is not None and line.listen_only and request[:3] != b"\x08\x00\x01":
             outcome = LineReply(b"", silent=True)  # only a restart is carried out
+        elif broadcast and function in READING:
+            outcome = LineReply(b"", silent=True)  # nobody would see what was read, or taken out of the queue
         else:
             outcome = _outcome(request, server)
             server.counters.good += 1

@@ -13,57 +13,28 @@ from dataclasses import asdict, replace
 import pytest
 from pymodbus.pdu import DecodePDU
 
-from gateway.commands import CommandQueue, Outlet
 from gateway.modbus.diagnostics import LineDiagnostics
 from gateway.modbus.identification import Identity
-from gateway.modbus.pdu import Span, Table
 from gateway.modbus.server import Server, answer
-from gateway.register import DataRegister, Sample, Source, SourceKind
-from tests.fakes import SCADA, JumpingClock
+from gateway.register import DataRegister
+from tests.fakes import JumpingClock
 from tests.modbus import wire
-
-FIELD = Source(SourceKind.REQUEST, "field/boiler")
-HOLDING = Table.HOLDING_REGISTERS
-
-QUERY = "08 00 00 A5 37"
-RESTART = "08 00 01 00 00"
-RESTART_AND_CLEAR_LOG = "08 00 01 FF 00"
-LISTEN_ONLY = "08 00 04 00 00"
-CLEAR = "08 00 0A 00 00"
-EVENT_COUNTER = "0B"
-EVENT_LOG = "0C"
-
-COUNTERS = {  # sub-function: the counter's name in the code, its name in appendix A
-    0x0B: "bus_messages",  # CPT1
-    0x0C: "bus_errors",  # CPT2
-    0x0D: "exceptions",  # CPT3
-    0x0E: "messages",  # CPT4
-    0x0F: "unanswered",  # CPT5
-    0x10: "naks",  # CPT6
-    0x11: "busy",  # CPT7
-    0x12: "overruns",  # CPT8
-}
-KNOWN_SUBS = [0, 1, 2, 4, *range(10, 19)]
-REQUEST_OF_EACH = {
-    1: "01 00 00 00 01",
-    2: "02 00 00 00 01",
-    3: "03 00 00 00 01",
-    4: "04 00 00 00 01",
-    5: "05 00 00 FF 00",
-    6: "06 00 00 12 34",
-    7: "07",
-    8: QUERY,
-    11: "0B",
-    12: "0C",
-    15: "0F 00 00 00 01 01 01",
-    16: "10 00 00 00 01 02 12 34",
-    17: "11",
-    22: "16 00 00 00 00 12 34",
-    23: "17 00 00 00 01 00 00 00 01 02 12 34",
-    24: "18 00 00",
-    43: "2B 0E 01 00",
-    65: "41  # nobody knows it",
-}
+from tests.modbus.line_server import (
+    CLEAR,
+    COUNTERS,
+    EVENT_COUNTER,
+    KNOWN_SUBS,
+    LISTEN_ONLY,
+    QUERY,
+    REQUEST_OF_EACH,
+    RESTART,
+    RESTART_AND_CLEAR_LOG,
+    a_server,
+    asked,
+    counter,
+    everything,
+    no_room,
+)
 
 
 @pytest.fixture
@@ -73,37 +44,7 @@ def line() -> LineDiagnostics:
 
 @pytest.fixture
 def server(register: DataRegister, line: LineDiagnostics) -> Server:
-    """A server on a serial line whose 8 outputs are those of section 6.7's example."""
-    return Server(
-        register, SCADA, line=line, identity=Identity("Acme", "GW-1", "2.11"), exception_status=lambda: 0b0110_1101
-    )
-
-
-def asked(server: Server, request: str, broadcast: bool = False) -> str:
-    """The reply to *request*, both in hexadecimal; it was on the line like every message."""
-    assert server.line is not None
-    server.line.heard()
-    return answer(wire(request), server, broadcast).hex(" ").upper()
-
-
-def counter(server: Server, sub: int) -> int:
-    """What sub-function *sub* tells; the request that asks counts itself."""
-    reply = asked(server, f"08 00 {sub:02X} 00 00")
-    assert reply.startswith(f"08 00 {sub:02X} ")
-    return int(reply[9:].replace(" ", ""), 16)
-
-
-def events(server: Server) -> str:
-    """The event log, newest first, without the receive event of the request that asks for it."""
-    reply = bytes.fromhex(asked(server, EVENT_LOG))
-    assert len(reply) == 2 + reply[1]
-    assert reply[8] & 0xDF == 0x80  # the request itself
-    return reply[9:].hex(" ").upper()
-
-
-def everything(register: DataRegister) -> list[list[Sample]]:
-    """Value, quality, age and source of every point."""
-    return [register.samples(Span(table, 0, register.size(table))) for table in Table]
+    return a_server(register, line)
 
 
 # ------------------------------------------------------------------------------------------------ as printed
@@ -389,11 +330,8 @@ def test_cpt6_counts_exception_7_where_it_was_answered(line: LineDiagnostics, an
 
 @pytest.fixture
 def full(server: Server, clock: JumpingClock) -> Iterator[Server]:
-    """A server whose writes to holding register 0 find no room in the queue of commands."""
-    queue = CommandQueue(server.register, clock, wake=lambda: None, limit=0)
-    queue.add(Outlet(Span(HOLDING, 0, 1), FIELD))
-    yield server
-    queue.close()
+    with no_room(server, clock) as without_room:
+        yield without_room
 
 
 def test_cpt7_counts_busy_answers_and_not_what_a_broadcast_is_not_told(full: Server) -> None:
@@ -457,131 +395,6 @@ def test_clear_and_restart_set_every_counter_to_0_and_answer_first(
     )
     assert asked(server, EVENT_COUNTER) == "0B 00 00 00 00"
     assert counter(server, 0x0E) == 2  # function 11 before, and this one
-
-
-# ------------------------------------------------------------------------------------------------ the event counter
-
-
-def test_the_event_counter_counts_messages_carried_out(server: Server) -> None:
-    for request in ("07", "03 00 00 00 01", "06 00 00 12 34", QUERY, "11", "2B 0E 01 00"):
-        asked(server, request)
-    asked(server, "06 00 00 12 35", broadcast=True)
-    assert asked(server, EVENT_COUNTER) == "0B 00 00 00 07"
-
-
-def test_the_event_counter_counts_no_exceptions_and_not_function_11(server: Server) -> None:
-    asked(server, "07")
-    for request in ("41", "07 00", "03 FF FF 00 01", "0B 00"):
-        asked(server, request)
-    asked(server, "06 FF FF 12 34", broadcast=True)
-    for _ in range(3):
-        assert asked(server, EVENT_COUNTER) == "0B 00 00 00 01"
-
-
-def test_the_event_log_counts_as_an_event_only_after_it_was_told(server: Server) -> None:
-    assert asked(server, EVENT_LOG)[6:17] == "00 00 00 00"
-    assert asked(server, EVENT_COUNTER) == "0B 00 00 00 01"
-
-
-def test_listening_only_carries_out_nothing_that_would_be_an_event(listening: Server, line: LineDiagnostics) -> None:
-    asked(listening, "07")
-    assert line.events == 1  # the request that led there
-
-
-# ------------------------------------------------------------------------------------------------ the event log
-
-
-def test_the_log_of_a_new_line_holds_only_the_request_that_asks(server: Server) -> None:
-    assert asked(server, EVENT_LOG) == "0C 07 00 00 00 00 00 01 80"
-
-
-def test_each_message_leaves_a_receive_and_a_send_event_newest_first(server: Server, line: LineDiagnostics) -> None:
-    asked(server, "07")
-    assert events(server) == "40 80"
-    line.heard_damaged()
-    assert events(server) == "82 40 80 40 80"  # damaged; function 12; function 7
-
-
-@pytest.mark.parametrize(
-    ("exception", "sent"),
-    [
-        (0, 0x40),
-        (1, 0x41),  # bit 0: read exception
-        (2, 0x41),
-        (3, 0x41),
-        (4, 0x42),  # bit 1: abort
-        (5, 0x44),  # bit 2: busy
-        (6, 0x44),
-        (7, 0x48),  # bit 3: program NAK
-        (8, 0x40),  # section 6.10 has no bit for these
-        (10, 0x40),
-        (11, 0x40),
-    ],
-)
-def test_a_send_event_says_which_exception_was_sent(line: LineDiagnostics, exception: int, sent: int) -> None:
-    line.carried_out(3, exception, answered=True)
-    assert list(line.log) == [sent]
-
-
-def test_a_busy_answer_is_logged_as_one(full: Server) -> None:
-    asked(full, "06 00 00 12 34")
-    assert events(full) == "44 80"
-
-
-def test_a_broadcast_is_logged_as_one_and_its_exception_as_not_sent(server: Server) -> None:
-    asked(server, "06 00 00 12 34", broadcast=True)
-    assert events(server) == "40 C0"
-    asked(server, "06 FF FF 12 34", broadcast=True)
-    assert events(server) == "40 C0 40 80 40 C0"
-
-
-def test_listening_only_is_in_the_log_from_its_beginning_to_its_end(listening: Server, line: LineDiagnostics) -> None:
-    asked(listening, "07")
-    asked(listening, "06 FF FF 12 34", broadcast=True)
-    line.heard_damaged()
-    asked(listening, RESTART)
-    told = """
-        00       # restarted
-        60 A0    # the restart, while listening only: sent (nothing), received
-        A2       # damaged
-        60 E0    # the broadcast
-        60 A0    # function 7
-        04       # entered listen only mode
-        40 80    # the request to enter it
-    """
-    assert events(listening) == wire(told).hex(" ").upper()
-
-
-def test_a_restart_keeps_the_log_and_adds_to_it(server: Server) -> None:
-    asked(server, "41")
-    asked(server, RESTART)
-    assert events(server) == "00 40 80 41 80"
-
-
-def test_a_restart_with_ff00_leaves_nothing_in_the_log_but_itself(server: Server) -> None:
-    asked(server, "41")
-    asked(server, RESTART_AND_CLEAR_LOG)
-    assert events(server) == "00"
-
-
-def test_clearing_the_counters_leaves_the_log(server: Server) -> None:
-    asked(server, "41")
-    asked(server, CLEAR)
-    assert events(server) == "40 80 41 80"
-
-
-def test_the_log_keeps_the_newest_64_events(server: Server, line: LineDiagnostics) -> None:
-    for _ in range(10):
-        line.heard_damaged()
-    for _ in range(27):
-        asked(server, "07")
-    #  10 + 2 x 27 are 64; the request that asks pushes the oldest out
-    reply = asked(server, EVENT_LOG)
-    assert reply == "0C 46 00 00 00 1B 00 1C 80" + " 40 80" * 27 + " 82" * 9
-    assert len(bytes.fromhex(reply)) == 8 + 64
-    for _ in range(40):
-        asked(server, "41")
-    assert asked(server, EVENT_LOG) == "0C 46 00 00 00 1C 00 45 80" + " 41 80" * 31 + " 41"
 
 
 # ------------------------------------------------------------------------------------------------ another's reading

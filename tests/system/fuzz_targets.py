@@ -14,6 +14,7 @@ Two ways to feed them, each in a process of its own, with a JSON object of figur
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import random
@@ -149,9 +150,11 @@ def framer_target(framing: Framing, is_reply: bool, bodies: Sequence[bytes]) -> 
 
 CLIENT = Source(SourceKind.CLIENT, "a client")
 REQUEST = Source(SourceKind.REQUEST, "field/boiler")
-EVENTS_MAX = 50
+EVENTS_MAX = 8
+COMMANDS_MAX = 5
 FIFO_POINT, BLOCK = 900, Span(Table.HOLDING_REGISTERS, 500, 3 + 7 * 10)
 WRITTEN = (Table.COILS, Table.HOLDING_REGISTERS)
+READING = {1, 2, 3, 4, 24, 43}  # of no use to everybody at once
 REFUSALS = {1, 2, 3, 4, 6, 11}
 
 
@@ -163,7 +166,7 @@ class AnswerEar:
         self._register = DataRegister(self._clock, dict.fromkeys(Table, 1000))
         watched = [Span(Table.COILS, 0, 100), Span(Table.HOLDING_REGISTERS, 0, 100)]
         self._events = EventQueue(self._register, self._clock, watched, EVENTS_MAX, FIFO_POINT, BLOCK)
-        self._queue = CommandQueue(self._register, self._clock, lambda: None, limit=5)
+        self._queue = CommandQueue(self._register, self._clock, lambda: None, limit=COMMANDS_MAX)
         for table in WRITTEN:
             self._queue.add(Outlet(Span(table, 20, 50), REQUEST))
         polled = Span(Table.HOLDING_REGISTERS, 80, 10)
@@ -184,33 +187,36 @@ class AnswerEar:
         server = self._servers[how & 3]
         self._clock.pass_s(0.05)
         before = self._values()
-        reply = answer(data[:253], server, broadcast=how & 28 == 28)
-        self._judge(data, server, reply)
-        if reply and reply[0] & 0x80:
-            assert self._values() == before, "a refused request changed something"
+        is_broadcast = server.line is not None and how & 28 == 28
+        reply = answer(data[:253], server, is_broadcast)
+        if reply:
+            self._judge(data, reply)
+        else:
+            is_unseen = is_broadcast and data[0] in READING
+            assert is_unseen or (server.line and (self.line.listen_only or data[:3] == b"\x08\x00\x01"))
+        if not reply or reply[0] & 0x80:
+            assert self._values() == before, "a request that was not carried out changed something"
         assert len(self.line.log) <= 64
         assert self._events.waiting <= EVENTS_MAX
-        assert len(self._queue) <= 5
+        assert len(self._queue) <= COMMANDS_MAX + 1  # a command taken over stays until its room is needed
 
     def finish(self) -> None:
         server = self._servers[-1]  # no message makes a slave on the network deaf
         assert answer(b"\x03\x00\x64\x00\x01", server)[:2] == b"\x03\x02"
 
-    def _judge(self, request: bytes, server: Server, reply: bytes) -> None:
-        if not reply:
-            assert server.line is not None
-            assert self.line.listen_only or request[:3] == b"\x08\x00\x01"
-        elif reply[0] & 0x80:
+    @staticmethod
+    def _judge(request: bytes, reply: bytes) -> None:
+        if reply[0] & 0x80:
             assert reply[0] == request[0] | 0x80
             assert reply[1] in REFUSALS
             assert len(reply) == 2
-        else:
-            assert reply[0] == request[0]
-            assert len(reply) <= 253
-            if reply[0] in (1, 2, 3, 4, 12, 17, 23):
-                assert reply[1] == len(reply) - 2
-            elif reply[0] in (5, 6, 15, 16, 22):
-                assert reply == request[: 7 if reply[0] == 22 else 5]
+            return
+        assert reply[0] == request[0]
+        assert len(reply) <= 253
+        if reply[0] in (1, 2, 3, 4, 12, 17, 23):
+            assert reply[1] == len(reply) - 2
+        elif reply[0] in (5, 6, 15, 16, 22):
+            assert reply == request[: 7 if reply[0] == 22 else 5]
 
     def _values(self) -> list[bytes]:
         with self._register.lock:
@@ -275,26 +281,35 @@ def true_reply(request: AnyRequest, rng: random.Random) -> bytes:
 ALIKE = {asked.function: [other for other in REQUESTS if other.function == asked.function] for asked in REQUESTS}
 
 
+def brought(request: AnyRequest, data: bytes) -> bytes | int | None:
+    """Return the data that *data* brings, the exception it tells, or None if it answers another question."""
+    try:
+        return decode_reply(request, data)
+    except DeviceRefused as refused:
+        return refused.code
+    except ReplyMismatch:
+        return None
+
+
 class ReplyEar:
     """What a master makes of a PDU as the answer to a request, mostly one of its function."""
 
     def take(self, how: int, data: bytes) -> None:
         alike = ALIKE.get(data[0] & 0x7F) if data and how & 3 else None
         request = alike[how % len(alike)] if alike else REQUESTS[how]
-        try:
-            found = decode_reply(request, data)
-        except DeviceRefused as refused:
-            assert data == bytes([request.function | 0x80, refused.code])
-            assert refused.code
-            return
-        except ReplyMismatch:
-            return
-        assert data[0] == request.function
-        if isinstance(request, ReadRequest | ReadWriteRequest):
-            size = (request.quantity + 7) // 8 if request.function <= 2 else 2 * request.quantity
-            assert len(found) == size == data[1] == len(data) - 2
-        else:
-            assert found == (data[1:] if isinstance(request, PlainRequest) else b"")
+        match brought(request, data):
+            case None:
+                pass
+            case int(code):
+                assert code
+                assert data == bytes([request.function | 0x80, code])
+            case found if isinstance(request, ReadRequest | ReadWriteRequest):
+                size = (request.quantity + 7) // 8 if request.function <= 2 else 2 * request.quantity
+                assert data[:2] == bytes([request.function, size])
+                assert len(found) == size == len(data) - 2
+            case found:
+                assert data[0] == request.function
+                assert found == (data[1:] if isinstance(request, PlainRequest) else b"")
 
     def finish(self) -> None:
         """Nothing is kept from one reply to the next."""
@@ -304,7 +319,10 @@ class ReplyEar:
 
 
 def requests_of_units() -> list[bytes]:
-    return [bytes([number % 5 and UNIT]) + encode_request(request) for number, request in enumerate(REQUESTS)]
+    """Requests of every kind, and the acknowledgements that empty the event queue."""
+    taken = [WriteRequest(6, BLOCK.start, 1, bytes([0, sequence])) for sequence in range(1, EVENTS_MAX + 1)]
+    asked = enumerate([*REQUESTS, *taken])
+    return [bytes([number % 5 and UNIT]) + encode_request(request) for number, request in asked]
 
 
 def replies_of_units() -> list[bytes]:
@@ -333,22 +351,24 @@ TARGETS: dict[str, Target] = {
 
 @dataclass
 class Figures:
-    """What came of a run; memory in KiB, after warm-up and at the end."""
+    """What came of a run; memory after warm-up and at the end: the process in KiB, and Python's blocks of memory."""
 
     inputs: int = 0
     slowest_ms: float = 0.0
     seconds: float = 0.0
-    rss_warm_kib: int = 0
-    rss_kib: int = 0
+    rss_kib: list[int] = field(default_factory=list)
+    blocks: list[int] = field(default_factory=list)
     repeated: list[float] = field(default_factory=list)  # ms of what was slow once, at its fastest
+
+    def look_at_memory(self) -> None:
+        """Note what is held now; what only waits for the garbage collector is not held."""
+        gc.collect()
+        status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+        self.rss_kib.append(int(status["VmRSS"].split()[0]))
+        self.blocks.append(sys.getallocatedblocks())
 
     def print(self) -> None:
         print(json.dumps({**vars(self), "slowest_ms": round(self.slowest_ms, 3), "seconds": round(self.seconds, 1)}))
-
-
-def rss_kib() -> int:
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return int(status["VmRSS"].split()[0])
 
 
 def longest_s(target: Target, stream: Sequence[Step]) -> float:
@@ -413,9 +433,11 @@ def run_fast(name: str, inputs: int, seed: int) -> Figures:
         for _ in range(bulk // STREAM):
             feed(target, [next(steps) for _ in range(STREAM)], figures)
         figures.inputs += bulk
-        if not figures.rss_warm_kib and figures.inputs >= WARM_UP * inputs:
-            figures.rss_warm_kib = rss_kib()
-    figures.rss_kib, figures.seconds = rss_kib(), perf_counter() - began_s
+        gc.collect()  # ears are circles of references
+        if not figures.rss_kib and figures.inputs >= WARM_UP * inputs:
+            figures.look_at_memory()
+    figures.look_at_memory()
+    figures.seconds = perf_counter() - began_s
     return figures
 
 
@@ -444,10 +466,10 @@ def run_guided(atheris: Any, name: str, seconds: float, corpus: str) -> None:
         feed(target, steps_in(data, target.seal), figures)
         figures.inputs += 1
         figures.seconds = perf_counter() - began_s
-        if not figures.rss_warm_kib and figures.seconds >= WARM_UP * seconds:
-            figures.rss_warm_kib = rss_kib()
+        if not figures.rss_kib and figures.seconds >= WARM_UP * seconds:
+            figures.look_at_memory()
         if figures.seconds >= seconds:
-            figures.rss_kib = rss_kib()
+            figures.look_at_memory()
             figures.print()
             sys.stdout.flush()
             os._exit(0)  # atheris has no other end without a finding
