@@ -103,7 +103,8 @@ class SharedLine:
         """Return once *condition* is true; asked again at each change on the line or in an ear."""
         with self.changed:
             happened = self.changed.wait_for(lambda: self._error or condition(), PATIENCE_S)
-            assert happened and self._error is None, f"{what}: not within {PATIENCE_S:g} s; {self.lately()}"
+            assert happened, f"{what}: not within {PATIENCE_S:g} s; {self.lately()}"
+            assert self._error is None, f"the line broke: {self._error!r}"
 
     def lately(self) -> str:
         """The end of the transcript, for people."""
@@ -161,6 +162,7 @@ class Foreigner:
     def __init__(self, line: SharedLine, who: str) -> None:
         self.who, self._line, self._plug = who, line, line.plug_in(who)
         self._fd = os.open(self._plug.pty.device, os.O_RDWR | os.O_NOCTTY)
+        self._said = 0
 
     def say(self, data: bytes, cuts: tuple[int, ...] = (), pause_s: float = 0.0) -> None:
         """Say *data*, in pieces where *cuts* are given, with *pause_s* between them; return once it was carried."""
@@ -168,9 +170,9 @@ class Foreigner:
         for start, stop in zip((0, *cuts), (*cuts, len(data)), strict=True):
             if start:
                 keep_silence(pause_s)
-            goal = self._plug.carried_from + stop - start
+            self._said += stop - start
             assert os.write(self._fd, data[start:stop]) == stop - start
-            self._line.wait_until(lambda goal=goal: self._plug.carried_from == goal, f"{self.who} is carried")
+            self._line.wait_until(lambda: self._plug.carried_from == self._said, f"{self.who} is carried")
 
     def close(self) -> None:
         os.close(self._fd)

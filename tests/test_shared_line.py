@@ -326,7 +326,7 @@ def test_among_strangers_each_request_is_answered_once_by_its_unit_and_nothing_e
     framing: str, seed: int
 ) -> None:
     with shared(framing, seed) as scene:
-        talk(scene, 60)
+        talk(scene, 45)
 
 
 @both_framings

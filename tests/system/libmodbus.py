@@ -281,7 +281,7 @@ def server_tcp(size: int) -> Iterator[tuple[Server, int]]:
     modbus = library()
     context = modbus.modbus_new_tcp(b"127.0.0.1", 0)
     listening = checked(modbus, modbus.modbus_tcp_listen(context, 4))
-    with contextlib.closing(Server(modbus, context, size)) as server, socket.socket(fileno=listening) as listener:
+    with socket.socket(fileno=listening) as listener, contextlib.closing(Server(modbus, context, size)) as server:
         modbus.modbus_set_socket(context, -1)
 
         def serve() -> None:
