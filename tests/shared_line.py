@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 
 from gateway.clock import SystemClock
 from gateway.config import SlaveConfig
@@ -64,7 +65,7 @@ class Plug:
 
 
 class SharedLine:
-    """The wires; the transcript is in ``said``.
+    """The wires; the transcript is in ``said`` and ``when_s``.
 
     character_s: seconds that a byte takes; 0.0: each piece is carried at once. Two who talk at the same time are both
                  carried, byte by byte in turn: a collision shows in the transcript.
@@ -73,6 +74,7 @@ class SharedLine:
     def __init__(self, character_s: float = 0.0) -> None:
         self.changed = threading.Condition()
         self.said: Said = []
+        self.when_s: list[float] = []  # when each piece of it was carried
         self._character_s = character_s
         self._plugs: dict[str, Plug] = {}
         self._error: BaseException | None = None
@@ -105,6 +107,12 @@ class SharedLine:
             happened = self.changed.wait_for(lambda: self._error or condition(), PATIENCE_S)
             assert happened, f"{what}: not within {PATIENCE_S:g} s; {self.lately()}"
             assert self._error is None, f"the line broke: {self._error!r}"
+
+    def pauses_before(self, who: str) -> list[float]:
+        """The silence, in seconds, before each time that *who* began to speak after somebody else."""
+        pieces = [(*piece, when) for piece, when in zip(self.said, self.when_s, strict=True)]
+        turns = [(last, this) for last, this in pairwise(pieces) if this[0] == who != last[0]]
+        return [this[2] - last[2] for last, this in turns]
 
     def lately(self) -> str:
         """The end of the transcript, for people."""
@@ -144,6 +152,7 @@ class SharedLine:
             return
         with self.changed:
             self.said.append((plug.who, data))
+            self.when_s.append(now_s())
             plug.carried_from += len(data)
             for other in self._plugs.values():
                 if other is not plug:
@@ -190,13 +199,16 @@ class Ear:
         self.discard, self.close = link.discard, link.close
         self._link, self._line, self._plug = link, line, plug
         self._heard = self._spoken = 0
+        self._is_waiting = False  # for the next byte; the last wait ended with nothing
         self._is_idle = False  # waits for a byte, and for nothing else
+        self._is_silent = True  # the last read brought nothing
         self._held = ""
         self._is_stuck = False  # has read, and is held
         self._backlog = b""  # read, and not handed on yet
 
     def read(self, timeout_s: float) -> bytes:
         with self._line.changed:
+            self._is_waiting = self._is_silent
             self._is_idle = timeout_s > DEADLINE_MAX_S and not self._backlog
             self._line.changed.notify_all()
         backlog, self._backlog = self._backlog, b""
@@ -204,7 +216,8 @@ class Ear:
             return backlog  # counted when it was read
         data = self._link.read(timeout_s)
         with self._line.changed:
-            self._is_idle = False
+            self._is_waiting = self._is_idle = False
+            self._is_silent = not data
             self._heard += len(data)
             how = self._wait_for_release() if self._held and data else ""
             self._line.changed.notify_all()
@@ -229,6 +242,10 @@ class Ear:
         with self._line.changed:
             self._held = ""
             self._line.changed.notify_all()
+
+    def has_heard_silence(self) -> bool:
+        """True if it has read all, and has waited in vain for more."""
+        return self._is_waiting and self._heard == self._plug.carried_to
 
     def is_at_rest(self) -> bool:
         """True if it has read all, all it wrote was carried, and no silence or part of a frame is waited out."""

@@ -112,6 +112,9 @@ class Liar:
             self.exception_0,
             *(serial if self.framing != "tcp" else [self.other_transaction, self.other_protocol]),
         ]  # fmt: skip
+        # A connection brings no late reply in the middle of another. On a serial line, damage that an earlier lie left
+        # behind ends the wait at once, and the line then listens for one reply time, not for two.
+        self._alone = [self.cut_off, self.half_of_it_late] if self.framing == "tcp" else [self.late]
 
     def __call__(self, frame: bytes) -> Script:
         """Answer what was asked; the frame itself says only its transaction."""
@@ -126,8 +129,8 @@ class Liar:
             self.kind = "truth"
             return self.after(self.true_frame(self.asked))
         lie = self.rng.choice(self._lies)
-        if self.framing == "tcp" and lie in (self.cut_off, self.half_of_it_late) and not self.is_idle():
-            lie = self.other_transaction  # a connection brings no late reply in the middle of another
+        if lie in self._alone and not self.is_idle():
+            lie = self.other_unit
         self.kind = lie.__name__
         return lie(self.asked)
 
