@@ -163,7 +163,7 @@ class DescriptorLink:
         ready = wait_ready((self._fd, self.waker.fileno()), (), timeout_s)
         if self._fd in ready:
             return self._take()
-        if ready:
+        if ready and timeout_s > 0:  # a look that does not wait leaves a wake to the wait it is meant for
             self.waker.clear()
         return b""
 

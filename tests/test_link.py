@@ -123,6 +123,13 @@ def test_a_wake_from_another_thread_ends_a_wait_without_limit(waker: Waker) -> N
     thread.join()
 
 
+def test_a_look_that_does_not_wait_leaves_a_wake_to_the_next_wait(line: DescriptorLink, waker: Waker) -> None:
+    waker.wake()
+    assert line.read(0) == b""
+    assert seconds(lambda: line.read(PATIENCE_S)) < PATIENCE_S / 2
+    assert not waker.wait(0)
+
+
 def test_an_ended_waker_ends_every_wait_for_good_whatever_is_cleared(pty: Pty, waker: Waker) -> None:
     with contextlib.closing(ports.open_serial(pty.settings(), waker, CLOCK)) as line:
         threading.Thread(target=waker.end).start()
