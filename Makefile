@@ -2,7 +2,7 @@
 # make test   the tests; needs only Python (3.11 or newer, with pip and venv)
 # make check  the tests with coverage, ruff, mypy
 # make bench  how fast it is, against a peer in the same run
-# make system-test   what takes minutes; writes tests/system/LAST.md
+# make system-test   what takes minutes; writes tests/system/LAST.md; TESTS="FILE ..." for some of it
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -34,7 +34,7 @@ bench: $(VENV)/.test
 	$(BIN)/python -m bench.run
 
 system-test: $(VENV)/.system
-	$(BIN)/python -m tests.system.run
+	$(BIN)/python -m tests.system.run $(TESTS)
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "rtugate needs Python 3.11 or newer: make PYTHON=...")'

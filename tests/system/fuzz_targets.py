@@ -49,7 +49,7 @@ from gateway.register import DataRegister, Quality, Source, SourceKind
 from tests.fakes import JumpingClock
 
 SLOW_S = 0.010  # no input takes longer
-TRIES = 3  # a machine that does something else makes an input slow once, but not so often again
+TRIES = 9  # a machine that does something else makes an input slow once, but not so often again
 READ_MAX = 8192  # bytes that one read of a line brings at most
 STREAM = 32  # inputs that one ear hears, in the fast way
 STEPS_MAX = 16  # the same, in one guided input
@@ -163,8 +163,8 @@ class AnswerEar:
 
     def __init__(self) -> None:
         self._clock = JumpingClock()
-        self._register = DataRegister(self._clock, dict.fromkeys(Table, 1000))
-        watched = [Span(Table.COILS, 0, 100), Span(Table.HOLDING_REGISTERS, 0, 100)]
+        self._register = DataRegister(self._clock, dict.fromkeys(Table, 2000))
+        watched = [Span(Table.COILS, 0, 2000), Span(Table.HOLDING_REGISTERS, 0, 100)]
         self._events = EventQueue(self._register, self._clock, watched, EVENTS_MAX, FIFO_POINT, BLOCK)
         self._queue = CommandQueue(self._register, self._clock, lambda: None, limit=COMMANDS_MAX)
         for table in WRITTEN:
@@ -319,9 +319,15 @@ class ReplyEar:
 
 
 def requests_of_units() -> list[bytes]:
-    """Requests of every kind, and the acknowledgements that empty the event queue."""
+    """Requests of every kind, the largest there are, and the acknowledgements that empty the event queue."""
+    largest: list[AnyRequest] = [
+        WriteRequest(15, 0, 1968, SEEDS.randbytes(246)),
+        WriteRequest(16, 20, 123, SEEDS.randbytes(246)),
+        ReadWriteRequest(0, 125, 20, 121, SEEDS.randbytes(242)),
+        ReadRequest(1, 0, 2000),
+    ]
     taken = [WriteRequest(6, BLOCK.start, 1, bytes([0, sequence])) for sequence in range(1, EVENTS_MAX + 1)]
-    asked = enumerate([*REQUESTS, *taken])
+    asked = enumerate([*REQUESTS, *largest, *taken])
     return [bytes([number % 5 and UNIT]) + encode_request(request) for number, request in asked]
 
 
@@ -358,7 +364,7 @@ class Figures:
     seconds: float = 0.0
     rss_kib: list[int] = field(default_factory=list)
     blocks: list[int] = field(default_factory=list)
-    repeats: int = 0  # how often something was slower than all before, and was measured again
+    repeats: int = 0  # how often a stream that seemed slower than all before was measured again
 
     def look_at_memory(self) -> None:
         """Note what is held now; what only waits for the garbage collector is not held."""
@@ -386,8 +392,10 @@ def feed(target: Target, stream: Sequence[Step], figures: Figures) -> None:
     """Feed *stream* to a fresh ear, again where it was slow; AssertionError with the stream if anything is wrong."""
     try:
         took_s = longest_s(target, stream)
-        if 1000 * took_s > figures.slowest_ms:  # or was it the machine that did something else?
-            took_s = min(took_s, *(longest_s(target, stream) for _ in range(TRIES)))
+        for _ in range(TRIES):
+            if 1000 * took_s <= figures.slowest_ms:
+                break
+            took_s = min(took_s, longest_s(target, stream))  # or was it the machine that did something else?
             figures.repeats += 1
         assert took_s <= SLOW_S, f"an input took {1000 * took_s:.1f} ms"
     except Exception as error:  # whatever it is, it is what was looked for
@@ -418,8 +426,8 @@ def mutations(target: Target, rng: random.Random, count: int) -> Iterator[Step]:
                 yield how, wire + wires[(which + value) % len(wires)]
             case 6:  # noise before it
                 yield how, struct.pack("<HB", which, value)[: 1 + place % 3] + wire
-            case _ if value == 0 and place < 64:  # as much as a read brings, of the same few bytes
-                yield how, (wire[: 1 + place % 7] * READ_MAX)[: READ_MAX >> which % 5]
+            case _ if value == 0 and place < 64:  # as much as a read brings, of the same message or few bytes
+                yield how, ((wire if place & 8 else wire[: 1 + place % 7]) * READ_MAX)[: READ_MAX >> which % 5]
             case _:
                 yield how, struct.pack("<HHBB", which, which ^ 0x0103, value, place)[: 1 + place % 6]
 
