@@ -6,10 +6,14 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from gateway.register import DataRegister
 from tests.fakes import JumpingClock
+
+hypothesis.settings.register_profile("rtugate", deadline=None, derandomize=True)  # machines are noisy; fixed seeds
+hypothesis.settings.load_profile("rtugate")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
