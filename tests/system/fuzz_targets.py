@@ -427,8 +427,7 @@ def mutations(target: Target, rng: random.Random, count: int) -> Iterator[Step]:
             case 6:  # noise before it
                 yield how, struct.pack("<HB", which, value)[: 1 + place % 3] + wire
             case _ if value == 0 and place < 64:  # as much as a read brings, of the same message or few bytes
-                size, piece = READ_MAX >> which % 5, wire if place & 8 else wire[: 1 + place % 7]
-                yield how, (piece * (size // len(piece) + 1))[:size]
+                yield how, ((wire if place & 8 else wire[: 1 + place % 7]) * READ_MAX)[: READ_MAX >> which % 5]
             case _:
                 yield how, struct.pack("<HHBB", which, which ^ 0x0103, value, place)[: 1 + place % 6]
 

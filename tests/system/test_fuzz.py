@@ -24,7 +24,8 @@ from tests.system.fuzz_targets import SLOW_S, TARGETS, Figures, Target, feed, st
 GUIDED_S = float(os.environ.get("RTUGATE_FUZZ_S", "60"))
 INPUTS = int(os.environ.get("RTUGATE_FUZZ_INPUTS", "1000000"))
 PATIENCE_S = GUIDED_S + INPUTS / 10_000 + 120  # a process that has not ended by then hangs
-GROWTH_KIB = {"fast": 1024, "guided": 16384}  # atheris keeps inputs that reach something new, in the process
+# The allocator takes what the largest inputs need late; atheris keeps what reaches something new. Blocks are exact.
+GROWTH_KIB = {"fast": 4096, "guided": 16384}
 GROWTH_BLOCKS = 1000  # a hundredth of what the program is itself; an object left by every input would be thousands
 ROOT = Path(__file__).parents[2]
 GUIDED = """
