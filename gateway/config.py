@@ -40,7 +40,7 @@ from gateway.config_fields import (
     host_port,
     wrong,
 )
-from gateway.modbus.pdu import QUANTITY_LIMITS, READS, Table
+from gateway.modbus.pdu import QUANTITY_LIMITS, READS, TABLE_OF, Table
 
 FUNCTION_CODES: Final[dict[str, int]] = {
     "read-coils": 1,
@@ -71,16 +71,7 @@ TABLES: Final[dict[str, Table]] = {
 }
 TABLE_NAMES: Final = {table: name for name, table in TABLES.items()}
 FUNCTION_NAMES: Final = {code: name for name, code in SERVED_CODES.items()}
-NATURAL_TABLES: Final = {  # the table whose points a request carries, by function code
-    1: Table.COILS,
-    2: Table.DISCRETE_INPUTS,
-    3: Table.HOLDING_REGISTERS,
-    4: Table.INPUT_REGISTERS,
-    5: Table.COILS,
-    6: Table.HOLDING_REGISTERS,
-    15: Table.COILS,
-    16: Table.HOLDING_REGISTERS,
-}
+NATURAL_TABLES: Final = {code: TABLE_OF[code] for code in QUANTITY_LIMITS}  # whose points a request carries
 MODBUS_PORT: Final = 502  # Modbus Messaging on TCP/IP Implementation Guide V1.0b, section 3.1.3
 
 
