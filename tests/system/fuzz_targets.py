@@ -1,4 +1,4 @@
-"""What is fuzzed: every framing in both directions, what a slave answers, and how a master reads a reply.
+"""What is fuzzed: every framing in both directions, what a slave answers, how a master reads a reply, and telnet.
 
 An input is what one read of a line brings, or one PDU. Several make a stream, in one ``Ear``, because what came before
 matters; ``take`` and ``finish`` assert what must hold whatever comes. Where a checksum would hide everything behind it
@@ -47,6 +47,7 @@ from gateway.modbus.pdu import (
 from gateway.modbus.server import Server, answer
 from gateway.register import DataRegister, Quality, Source, SourceKind
 from tests.fakes import JumpingClock
+from tests.system.fuzz_telnet import TELNET_BODIES, TelnetEar
 
 SLOW_S = 0.010  # no input takes longer
 TRIES = 9  # a machine that does something else makes an input slow once, but not so often again
@@ -348,7 +349,7 @@ TARGETS: dict[str, Target] = {
     "tcp": framer_target("tcp", False, HEARD + SAID),  # both directions: one class, and nothing that tells them apart
     "answer": Target(AnswerEar, [body[1:] for body in HEARD], bytes),
     "reply": Target(ReplyEar, [body[1:] for body in SAID], bytes),
-    # The telnet filter belongs here: an Ear over it, and what a telnet client sends as its bodies.
+    "telnet": Target(TelnetEar, TELNET_BODIES, bytes),
 }
 
 
