@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 from gateway.backoff import Backoff
@@ -21,22 +21,31 @@ from gateway.clock import Clock
 from gateway.commands import Command, CommandQueue
 from gateway.config import MasterConfig
 from gateway.counters import PollCounters
-from gateway.errors import LinkError, QueueFull
+from gateway.errors import LinkError
 from gateway.link import Link, Waker
 from gateway.modbus.pdu import AnyRequest
-from gateway.polls import Device, Poll, ProbeBudget, Ticket, count_response, polls_of, status_span, timing_of
+from gateway.polls import Device, Poll, ProbeBudget, StatusPoints, count_response, polls_of, take_points, timing_of
 from gateway.register import DataRegister
 from gateway.schedule import Schedule
-from gateway.transaction import DAMAGED, TIMEOUT, Line, Response, check_asked
+from gateway.tickets import Ticket, TicketQueue
+from gateway.traffic import Tap
+from gateway.transaction import DAMAGED, TIMEOUT, Line, Response
 
 COMMANDS_IN_A_ROW: Final = 4  # then one poll goes through
-SUBMIT_LIMIT: Final = 16  # commands from the menu that wait
-SUBMIT_EXPIRE_S: Final = 10.0
 SILENT_TCP_LIMIT: Final = 3  # requests in a row without any answer: a half-open connection, made anew
 PROBE_LEAST_S: Final = 0.1  # a probe that found nothing to send is not tried again without a pause
-STATUS_EVERY_S: Final = 1.0
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class _Opened:
+    """The line while it is open, and how it has fared since then."""
+
+    link: Link
+    line: Line
+    silent_in_row: int = 0  # requests
+    has_answered: bool = False
 
 
 class Master:
@@ -59,38 +68,28 @@ class Master:
         self.counters = PollCounters()
         self.busy_s = 0.0  # of the line's time, silences and listening included
         self.polls, self.devices = polls_of(config)
+        self.traffic = Tap(config.framing_used, clock, config.character_timeout_used)
         self._register = register
         self._clock = clock
         self._waker = waker
         self._open_link = open_link
         self._wait_limit_s = wait_limit_s
-        self._link: Link | None = None
-        self._line: Line | None = None
+        self._opened: _Opened | None = None
         self._opening = Backoff(config.name, clock)
-        self._silent_in_row = 0
-        self._has_answered = False  # since the line was opened
         self._is_resting = False  # a connection that worked and was closed: opened again when there is work for it
-        scheduled = [poll for poll in self.polls if poll.is_scheduled]
-        self._scheduled = len(scheduled)
         self._busy_since_s: float | None = None  # since when the line has not been silent
-        self._schedule = Schedule([poll.config.every for poll in scheduled])
-        self._online = (1 << len(scheduled)) - 1
+        self._schedule = Schedule([poll.config.every for poll in self.polls if poll.is_scheduled])
+        self._scheduled = self._online = sum(device.polls for device in self.devices.values())  # as bits
         self._offline: set[Device] = set()
         self._probes = ProbeBudget()
         self._commands_in_row = 0
-        self._submitted: deque[Ticket] = deque()
-        self._status_s = 0.0
-        self._with_status = [poll for poll in self.polls if status_span(poll)]
+        self._tickets = TicketQueue(clock, waker.wake, has_broadcast=config.framing_used != "tcp")
+        self._status = StatusPoints(self.polls, register)
         self._stopping: Callable[[], bool] = lambda: False
         self._alive: Callable[[], None] = lambda: None
         self._queue = CommandQueue(register, clock, waker.wake)
-        self._undo: list[Callable[[], None]] = [self._queue.close]
         self._by_outlet = {poll.outlet: poll for poll in self.polls if poll.outlet}
-        for poll in self.polls:
-            if poll.outlet:
-                self._queue.add(poll.outlet)
-            else:
-                self._undo.append(register.claim(poll.span, poll.source, poll.config.stale_after_used))
+        self._undo = take_points(self.polls, register, self._queue)
 
     @property
     def trouble(self) -> str:
@@ -113,25 +112,20 @@ class Master:
         self.enabled = enabled
         self.wake()
 
-    def submit(self, unit: int, request: AnyRequest) -> Ticket:
-        """Queue a command before all polls. Raises QueueFull, RequestInvalid; the ticket's event tells when done.
+    def submit(self, unit: int, request: AnyRequest, told: Callable[[], None] | None = None) -> Ticket:
+        """Queue a command before all polls. Raises QueueFull, RequestInvalid.
 
-        It is given up, like any command, when it could not be sent within 10 s.
+        It is given up, like any command, when it could not be sent within 10 s: also where the line is in maintenance.
+        told: called once, when the ticket is done; from this master's thread, or at once where it has stopped.
         """
-        check_asked(unit, request, has_broadcast=self.config.framing_used != "tcp")
-        if len(self._submitted) >= SUBMIT_LIMIT:
-            raise QueueFull(f"{SUBMIT_LIMIT} commands wait for this line already")
-        ticket = Ticket(unit, request, self._clock.monotonic())
-        self._submitted.append(ticket)
-        self.wake()
-        return ticket
+        return self._tickets.submit(unit, request, told)
 
     def state(self) -> str:
         """Return what the line does, in one word or two."""
         if not self.enabled:
             return "maintenance"
-        line = self._line
-        return line.state.value if line else "no line"
+        opened = self._opened
+        return opened.line.state.value if opened else "no line"
 
     # -------------------------------------------------------------------------------------------- the thread
 
@@ -151,32 +145,32 @@ class Master:
         for undo in self._undo:
             undo()
         self._undo.clear()
-        while self._submitted:
-            self._submitted.popleft().done.set()
+        self._tickets.close()
 
     def step(self) -> None:
         """Do one thing: a command, a poll, a probe, opening the line; or wait for the next."""
         self._expire()
-        self._show_status()
+        self._status.show_all(self._clock.monotonic(), not self.enabled)
         if not self.enabled:
             self.ready.set()
             self._let_go()
             self._waker.wait(self._wait_s())
-        elif self._line is None:
+        elif self._opened is None:
             self._open()
         else:
             try:
-                self._work(self._line)
+                self._work(self._opened)
             except LinkError as error:
                 self._broke(str(error))
             else:
-                if self._line is not None and not self.config.is_tcp and self._opening.trouble:
+                if self._opened is not None and not self.config.is_tcp and self._opening.trouble:
                     self._opening.worked()  # a port has to carry something first; a connection, an answer
 
-    def _work(self, line: Line) -> None:
-        if self.config.is_tcp and self._silent_in_row >= SILENT_TCP_LIMIT:
+    def _work(self, opened: _Opened) -> None:
+        if self.config.is_tcp and opened.silent_in_row >= SILENT_TCP_LIMIT:
             self._renew("nothing answers")
             return
+        line = opened.line
         if not line.is_free or (line.silent_in_s() and not self._is_never_silent()):
             self._listen(line)
             return  # nothing is taken before it can be sent at once: a newer value may come meanwhile
@@ -203,13 +197,12 @@ class Master:
     def _wait_s(self) -> float:
         """How long nothing is due."""
         due_s = [self._clock.monotonic() + self._wait_limit_s]
-        if self.enabled and (self._line is not None or self._is_resting):
+        if self.enabled and (self._opened is not None or self._is_resting):
             due_s.append(self._schedule.next_due_s() or due_s[0])
             if self._offline:
                 due_s.append(self._probes.due_s())
-        due_s.append(self._queue.next_expiry_s() or due_s[0])
-        if self._with_status:
-            due_s.append(self._status_s)
+        for next_s in (self._queue.next_expiry_s(), self._tickets.next_expiry_s(), self._status.due_s()):
+            due_s.append(due_s[0] if next_s is None else next_s)
         return max(0.0, min(due_s) - self._clock.monotonic())
 
     # -------------------------------------------------------------------------------------------- the line
@@ -220,7 +213,7 @@ class Master:
             self._waker.wait(min(self._wait_s(), wait_s or self._wait_limit_s))
             return
         try:
-            self._link = self._open_link()
+            link = self._open_link()
         except LinkError as error:
             if not self._waker.ended:
                 self._lost(str(error))
@@ -228,20 +221,20 @@ class Master:
         finally:
             self.ready.set()
         log.debug("%s: polling on %s", self.name, self.config.line)
-        timing = timing_of(self.config, self._link.character_s)
-        self._line = Line(self._link, self.config.framing_used, timing, self._clock)
-        again = self._schedule.due(self._clock.monotonic()) if self._is_resting else (1 << self._scheduled) - 1
+        timing = timing_of(self.config, link.character_s)
+        line = Line(link, self.config.framing_used, timing, self._clock, self.traffic.tell)
+        self._opened = _Opened(link, line)
+        again = self._schedule.due(self._clock.monotonic()) if self._is_resting else self._scheduled
         self._schedule.at_once(again)  # what was missed meanwhile is no overrun
-        self._silent_in_row = 0
-        self._has_answered = self._is_resting = False
+        self._is_resting = False
 
     def _is_work_due(self) -> bool:
         is_probe_due = bool(self._offline) and self._clock.monotonic() >= self._probes.due_s()
-        return bool(self._submitted) or len(self._queue) > 0 or is_probe_due or self._poll_due() is not None
+        return len(self._tickets) > 0 or len(self._queue) > 0 or is_probe_due or self._poll_due() is not None
 
     def _broke(self, reason: str) -> None:
         """A connection that worked is made anew: devices close idle ones. Another is in trouble."""
-        if self._has_answered:
+        if self._opened is not None and self._opened.has_answered:
             self._renew(reason)
         else:
             self._lost(reason)
@@ -262,9 +255,10 @@ class Master:
                     poll.last_error = TIMEOUT
 
     def _let_go(self) -> None:
-        if self._link is not None:
-            self._link.close()
-        self._link = self._line = None
+        if self._opened is not None:
+            self._opened.link.close()
+            self.traffic.ended()
+        self._opened = None
 
     # -------------------------------------------------------------------------------------------- what is next
 
@@ -272,8 +266,9 @@ class Master:
         if self._commands_in_row >= COMMANDS_IN_A_ROW and self._poll_due() is not None:
             return False
         self._commands_in_row += 1  # also of one that ends the connection: polls go on after 4
-        if self._submitted:
-            self._carry_out_ticket(line, self._submitted.popleft())
+        ticket = self._tickets.take()
+        if ticket is not None:
+            self._carry_out_ticket(line, ticket)
             return True
         held_back = {outlet for device in self._offline for outlet in device.outlets}
         command = self._queue.take(held_back)
@@ -293,12 +288,16 @@ class Master:
         is_sent = any(
             self._probe(line, device, device in wanted) for device in self._probes.in_turn(self._offline, wanted)
         )
-        while self._line is line and not line.is_free and not self._stopping():
+        while self._has(line) and not line.is_free and not self._stopping():
             self._alive()
             self._listen(line)
-        least_s = PROBE_LEAST_S if self._line is line else self.config.response_timeout  # a connection has its price
+        least_s = PROBE_LEAST_S if self._has(line) else self.config.response_timeout  # a connection has its price
         self._probes.spent(began_s, max(self._clock.monotonic(), began_s + least_s))
         return is_sent
+
+    def _has(self, line: Line) -> bool:
+        """True while *line* is still the one that is open."""
+        return self._opened is not None and self._opened.line is line
 
     def _probe(self, line: Line, device: Device, is_wanted: bool) -> bool:
         """Send what there is for *device*; False if there is nothing."""
@@ -318,8 +317,9 @@ class Master:
     def _sendable(self, device: Device) -> int:
         """Return the scheduled requests of *device*, as bits, without the writes that have no values yet."""
         bits = 0
-        for index, poll in enumerate(self.polls[: self._scheduled]):
-            if poll.device is device and (poll.outlet is None or self._queue.cyclic_values(poll.outlet)):
+        for index, poll in enumerate(self.polls):
+            is_its = device.polls >> index & 1
+            if is_its and (poll.outlet is None or self._queue.cyclic_values(poll.outlet)):
                 bits |= 1 << index
         return bits
 
@@ -352,7 +352,7 @@ class Master:
         if response is None:
             return
         self._take_outcome(poll, index, number, response)
-        self._show(poll)
+        self._status.show(poll, self._clock.monotonic(), not self.enabled)
 
     def _take_outcome(self, poll: Poll, index: int, number: int, response: Response) -> None:
         if response.has_error():
@@ -399,16 +399,19 @@ class Master:
         else:
             poll.is_bad = False
             self._queue.answered(command)
-        self._show(poll)
+        self._status.show(poll, self._clock.monotonic(), not self.enabled)
 
     def _carry_out_ticket(self, line: Line, ticket: Ticket) -> None:
         self.counters.sent += 1
-        ticket.response = self._transact(line, ticket.unit, ticket.request, None)
-        ticket.done.set()
-        if ticket.response is not None:
-            count_response(self.counters, ticket.response)
+        response = None
+        try:
+            response = self._transact(line, ticket.unit, ticket.request, None)
+        finally:  # nobody waits for ever, even where a bug ends this thread
+            ticket.finish(response)
+        if response is not None:
+            count_response(self.counters, response)
             if ticket.unit in self.devices:
-                self._judge(self.devices[ticket.unit], ticket.response)
+                self._judge(self.devices[ticket.unit], response)
 
     def _ask(self, line: Line, poll: Poll, request: AnyRequest) -> Response | None:
         """Send *request* and wait for what becomes of it; None when stopped on the way."""
@@ -435,11 +438,11 @@ class Master:
                 self._broke(str(error))
             response = Response(unit, request.function, TIMEOUT, reason=str(error))
         self.busy_s += self._clock.monotonic() - began_s
-        if response is not None:
+        if response is not None and self._opened is not None:
             is_silent = response.error_code == TIMEOUT
-            self._silent_in_row = self._silent_in_row + 1 if is_silent else 0
-            if not is_silent and not self._has_answered:
-                self._has_answered = True
+            self._opened.silent_in_row = self._opened.silent_in_row + 1 if is_silent else 0
+            if not is_silent and not self._opened.has_answered:
+                self._opened.has_answered = True
                 self._opening.worked()
         return response
 
@@ -479,22 +482,5 @@ class Master:
             poll.counters.expired += 1
             self.counters.expired += 1
             log.warning("%s: point %d not written: not delivered in time", poll.source, command.span.start)
-        while self._submitted and self._clock.monotonic() >= self._submitted[0].made_s + SUBMIT_EXPIRE_S:
-            ticket = self._submitted.popleft()
+        for ticket in self._tickets.expire():
             log.warning("%s: unit %d: a command of the menu not sent in time", self.name, ticket.unit)
-            ticket.done.set()
-
-    def _show_status(self) -> None:
-        """Keep the status points up to date: once a second."""
-        now_s = self._clock.monotonic()
-        if now_s < self._status_s:
-            return
-        self._status_s = now_s + STATUS_EVERY_S
-        for poll in self._with_status:
-            self._show(poll)
-
-    def _show(self, poll: Poll) -> None:
-        span = status_span(poll)
-        if span is not None:
-            status = poll.status(self._clock.monotonic(), not self.enabled)
-            self._register.write(span, status, poll.source)

@@ -1,23 +1,22 @@
 """A master's requests and devices as they run: what is asked, and what becomes of the points (spec section 2).
 
 ``Poll`` is one request of the configuration with its place in the register, its counters and its state; ``Device`` is
-one unit of a line, alive or offline; ``ProbeBudget`` says when an offline device may be tried. None of them sends
-anything or knows the time: ``master.py`` does.
+one unit of a line, alive or offline; ``StatusPoints`` shows SCADA how the requests fare; ``ProbeBudget`` says when an
+offline device may be tried. None of them sends anything or knows the time: ``master.py`` does.
 """
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
-from gateway.commands import Command, Outlet
+from gateway.commands import Command, CommandQueue, Outlet
 from gateway.config import MasterConfig, RequestConfig
 from gateway.counters import PollCounters
 from gateway.link import silence_s
-from gateway.modbus.pdu import AnyRequest, ReadRequest, Request, Span, Table, WriteRequest, pack_words
+from gateway.modbus.pdu import ReadRequest, Request, Span, Table, WriteRequest, pack_words
 from gateway.register import DataRegister, Quality, Source, SourceKind
 from gateway.transaction import DAMAGED, NO_ERROR, TIMEOUT, Response, Timing
 
@@ -25,6 +24,7 @@ OFFLINE_AFTER: Final = 3  # failures in a row
 PROBE_SHARE: Final = 11  # one part probing, ten parts polling: 9.1 % of the line's time, at most 10 % is allowed
 PROBE_AT_LEAST_EVERY_S: Final = 60.0
 STATUS_COUNT: Final = 4  # input registers of a status_point
+STATUS_EVERY_S: Final = 1.0
 AGE_MAX_S: Final = 65535
 
 
@@ -97,10 +97,12 @@ class Poll:
     def status(self, now_s: float, maintenance: bool) -> bytes:
         """Return the 4 input registers of its status_point: state, age in s, failures, last error."""
         age_s = AGE_MAX_S if self.last_good_s is None else min(AGE_MAX_S, int(now_s - self.last_good_s))
-        state = Status.MAINTENANCE if maintenance else self._state(now_s)
-        return pack_words([state, age_s, self.counters.failures & 0xFFFF, self.last_error])
+        return pack_words([self.state(now_s, maintenance), age_s, self.counters.failures & 0xFFFF, self.last_error])
 
-    def _state(self, now_s: float) -> Status:
+    def state(self, now_s: float, maintenance: bool) -> Status:
+        """Return how it fares, at *now_s* (monotonic seconds)."""
+        if maintenance:
+            return Status.MAINTENANCE
         if self.device.is_offline:
             return Status.OFFLINE
         if self.is_bad:
@@ -185,18 +187,41 @@ def status_span(poll: Poll) -> Span | None:
     return Span(Table.INPUT_REGISTERS, point, STATUS_COUNT) if point >= 0 else None
 
 
-@dataclass(eq=False)
-class Ticket:
-    """A command from the menu, and later its response: None if it was never sent or the master was stopped.
+class StatusPoints:
+    """The status points of a line's requests: written whenever something has become of a request, and once a second."""
 
-    A line lost on the way is a timeout whose reason says so.
-    """
+    def __init__(self, polls: Sequence[Poll], register: DataRegister) -> None:
+        self._polls = [poll for poll in polls if status_span(poll)]
+        self._register = register
+        self._due_s = 0.0
 
-    unit: int
-    request: AnyRequest
-    made_s: float
-    response: Response | None = None
-    done: threading.Event = field(default_factory=threading.Event)
+    def due_s(self) -> float | None:
+        """Return from when on ``show_all`` has something to do (monotonic seconds); None: never."""
+        return self._due_s if self._polls else None
+
+    def show_all(self, now_s: float, maintenance: bool) -> None:
+        """Write all of them, if a second has passed since the last time."""
+        if now_s >= self._due_s:
+            self._due_s = now_s + STATUS_EVERY_S
+            for poll in self._polls:
+                self.show(poll, now_s, maintenance)
+
+    def show(self, poll: Poll, now_s: float, maintenance: bool) -> None:
+        """Write that of *poll*, if it has one."""
+        span = status_span(poll)
+        if span is not None:
+            self._register.write(span, poll.status(now_s, maintenance), poll.source)
+
+
+def take_points(polls: Sequence[Poll], register: DataRegister, queue: CommandQueue) -> list[Callable[[], None]]:
+    """Have each read of *polls* fill its points, and each write follow its own through *queue*; return the undoing."""
+    undo = [queue.close]
+    for poll in polls:
+        if poll.outlet:
+            queue.add(poll.outlet)
+        else:
+            undo.append(register.claim(poll.span, poll.source, poll.config.stale_after_used))
+    return undo
 
 
 def timing_of(master: MasterConfig, character_s: float) -> Timing:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from typing import Never
 
 from gateway.backoff import Backoff
 from gateway.clock import Clock
@@ -23,6 +24,7 @@ from gateway.modbus.pdu import BROADCAST
 from gateway.modbus.server import answer
 from gateway.register import DataRegister
 from gateway.serving import STATION_ALONE, Station, count_traffic, frames_in, server_of
+from gateway.traffic import Tap
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +48,7 @@ class SerialSlave:
         self.enabled = config.enabled
         self.ready = threading.Event()
         self.server = server_of(config, register, station)
+        self.traffic = Tap(config.framing_used, clock, config.character_timeout_used, config.unit)
         self._clock = clock
         self._waker = waker
         self._open_link = open_link
@@ -61,6 +64,11 @@ class SerialSlave:
     def counters(self) -> ServeCounters:
         """What was asked and answered."""
         return self.server.counters
+
+    @property
+    def clients(self) -> dict[int, Never]:
+        """TCP clients: there are none on a serial line."""
+        return {}
 
     @property
     def trouble(self) -> str:
@@ -122,17 +130,17 @@ class SerialSlave:
     def _let_go(self) -> None:
         if self._link is not None:
             self._link.close()
+            self.traffic.ended()
         self._link, self._is_talk = None, False
 
     def _listen(self, link: Link) -> None:
         now_s = self._clock.monotonic()
-        data = link.read(max(0.0, self._due_s(now_s) - now_s))
+        data = self._read(link, max(0.0, self._due_s(now_s) - now_s))
         now_s = self._clock.monotonic()
         if data:
-            self._framer.receive_data(data)
             self._heard_s, self._is_talk = now_s, True
             if self.config.framing_used == "ascii":
-                self._framer.receive_data(link.read(0.0))  # after a wait for the processor, what was read may be stale
+                self._read(link, 0.0)  # after a wait for the processor, what was read may be stale
                 self._answer_burst(link)
         elif self._is_talk and now_s >= self._heard_s + self._silence_s:
             self._is_talk = False
@@ -141,6 +149,12 @@ class SerialSlave:
         if self._framer.pending and now_s >= self._heard_s + self.config.character_timeout_used:
             self._framer.reset()
         self.counters.damaged = self._framer.damaged
+
+    def _read(self, link: Link, timeout_s: float) -> bytes:
+        data = link.read(timeout_s)
+        self._framer.receive_data(data)
+        self.traffic.tell(False, data)
+        return data
 
     def _due_s(self, now_s: float) -> float:
         if self._is_talk:
@@ -163,4 +177,6 @@ class SerialSlave:
             elif not is_last:
                 self.counters.unanswered += 1
             elif reply := answer(frame.pdu, self.server):
-                link.write(self._framer.encode(Frame(frame.unit, reply)))
+                data = self._framer.encode(Frame(frame.unit, reply))
+                link.write(data)
+                self.traffic.tell(True, data)

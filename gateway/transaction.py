@@ -7,7 +7,8 @@
 
 ``Line`` keeps the silences between frames, checks the reply against its request, and knows when the line is spoiled:
 after a timeout or a damaged frame a late reply may still come, which looks just like the answer to the next request of
-the same shape. It listens for one reply time, throws away what comes, and only then sends again. On Modbus TCP the
+the same shape. It waits for the time in which a reply was due to end, listens for one reply time more, throws away what
+comes, and only then sends again: what damage there was may not have been the reply. On Modbus TCP the
 transaction identifier tells late replies apart, so there is nothing to listen for.
 
 It decides nothing: which request is next, what is done about an error, is the master's affair.
@@ -421,7 +422,7 @@ class Line:
     def _fail(self, event: Event, code: int, reason: str) -> None:
         asked = self._asked
         assert asked is not None  # noqa: S101 - only what was asked can fail
-        now_s = self._clock.monotonic()
+        now_s, deadline_s = self._clock.monotonic(), self._deadline_s()
         self._pass(event)
         self._asked, self._reply = None, None
         self._done = Response(asked.unit, asked.request.function, code, b"", now_s - self._sent_s, reason)
@@ -429,7 +430,7 @@ class Line:
             self._pass(Event.SILENCE)  # a late reply is known by its number; half of one may become whole until then
         elif self.state is State.SPOILED:
             self._framer.reset()
-            self._until_s = now_s + asked.timeout_s
+            self._until_s = max(now_s, deadline_s) + asked.timeout_s  # damage makes no late reply come earlier
 
     def _finish(self, response: Response | None) -> None:
         self._pass(Event.SILENCE)

@@ -9,9 +9,9 @@ from itertools import pairwise
 import pytest
 
 from gateway.errors import LinkUnavailable, QueueFull, RequestInvalid
-from gateway.master import SUBMIT_LIMIT
 from gateway.modbus.pdu import ReadRequest, Span, Table, WriteRequest
 from gateway.register import Quality
+from gateway.tickets import SUBMIT_LIMIT
 from gateway.transaction import NO_ERROR, TIMEOUT
 from tests.fakes import JumpingClock, MasterBench, reads, words, writes
 

@@ -44,14 +44,38 @@ def test_after_a_timeout_the_line_listens_for_one_reply_time_before_it_sends(
     assert it.sent_s == [1000.0, gave_up_s + 2.5]
 
 
-def test_after_damage_the_line_listens_for_one_reply_time_too(clock: JumpingClock) -> None:
+def test_after_damage_the_line_listens_for_one_reply_time_behind_the_one_that_was_awaited(clock: JumpingClock) -> None:
     good = rtu(UNIT, ANSWER)
     it = bench(clock, "rtu", [(0.5, wrong_sum(good, "rtu"))], reply("rtu"))
     assert it.ask().error_code == DAMAGED
     damaged_s = 1000.0 + 8 * CHARACTER_S + 0.5 + 0.25  # the rest of a reply might still have come: character timeout
     assert clock.monotonic() == damaged_s
     it.ask()
+    assert it.sent_s[1] == 1000.0 + 8 * CHARACTER_S + 2.5 + 2.5
+
+
+def test_after_damage_at_the_last_moment_it_listens_for_one_reply_time_from_then(clock: JumpingClock) -> None:
+    it = bench(clock, "rtu", [(2.375, rtu(UNIT, ANSWER)[:5])], reply("rtu"))
+    assert it.ask().error_code == DAMAGED
+    damaged_s = 1000.0 + 8 * CHARACTER_S + 2.375 + 0.25
+    assert clock.monotonic() == damaged_s
+    it.ask()
     assert it.sent_s[1] == damaged_s + 2.5
+
+
+@pytest.mark.parametrize("damage", ["wrong CRC", "noise before", "more bytes behind"])
+def test_a_late_reply_never_lands_in_the_next_request_though_damage_came_in_time(
+    clock: JumpingClock, damage: str
+) -> None:
+    """The damage comes early; the true reply any time later, up to just before the end of the listening."""
+    good = rtu(UNIT, ANSWER)
+    early = {"wrong CRC": wrong_sum(good, "rtu"), "noise before": good[:4], "more bytes behind": good + b"\x00"}[damage]
+    for late_s in [i / 16 for i in range(12, 80)]:
+        late = rtu(UNIT, b"\x03\x06" + words(9, 9, 9))
+        it = bench(clock, "rtu", [(0.25, early), (late_s, late)], reply("rtu", at_s=1.0), reply("rtu"))
+        assert it.ask().error_code == DAMAGED
+        assert it.ask().data == words(555, 0, 100)
+        assert it.ask().data == words(555, 0, 100)
 
 
 @SERIAL

@@ -22,6 +22,7 @@ PDU_MAX: Final = 253  # section 4.1: bytes, function code included
 EXCEPTION_BIT: Final = 0x80  # section 7
 COIL_ON: Final = 0xFF00  # section 6.5
 COIL_OFF: Final = 0x0000
+FIFO_MAX: Final = 31  # registers, section 6.18
 BROADCAST: Final = 0  # serial line guide V1.02, section 2.2
 
 
@@ -383,8 +384,7 @@ def decode_reply(request: AnyRequest, pdu: bytes) -> bytes:
     if isinstance(request, ReadRequest | ReadWriteRequest):
         return _decode_data(request, pdu)
     if isinstance(request, PlainRequest):
-        repeated = {8: 2, 43: 2}.get(request.function, 0)  # sub-function; MEI type and code
-        if len(pdu) != pdu_length(REPLY_SHAPES, pdu) or pdu[1 : 1 + repeated] != request.body[:repeated]:
+        if len(pdu) != pdu_length(REPLY_SHAPES, pdu) or not _answers(request, pdu[1:]):
             raise ReplyMismatch(f"no reply to function {request.function} as it was asked")
         return pdu[1:]
     if pdu != _echo(request):
@@ -401,6 +401,16 @@ def _decode_data(request: ReadRequest | ReadWriteRequest, pdu: bytes) -> bytes:
     if span.table.is_bits and used:
         return data[:-1] + bytes([data[-1] & (1 << used) - 1])
     return data
+
+
+def _answers(request: PlainRequest, body: bytes) -> bool:
+    """True if *body*, of the length that it says it has, repeats what it must and its counts agree."""
+    if request.function == 24:  # section 6.18: the bytes that follow, then how many registers they are
+        return word_at(body, 0) == len(body) - 2 == 2 + 2 * word_at(body, 1) <= 2 + 2 * FIFO_MAX
+    repeated = {8: 2, 43: 2}.get(request.function, 0)  # sub-function; MEI type and code
+    if request.function == 8 and request.body[:2] == bytes(2):  # section 6.8.1: return query data
+        repeated = 4
+    return body[:repeated] == request.body[:repeated]
 
 
 def _echo(request: WriteRequest | MaskWriteRequest) -> bytes:

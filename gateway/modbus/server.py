@@ -20,6 +20,7 @@ from gateway.errors import PointUnknown, QueueFull, RequestRefused
 from gateway.modbus.diagnostics import LINE_FUNCTIONS, LineDiagnostics, LineReply, carry_out
 from gateway.modbus.identification import Identity, read_device_identification
 from gateway.modbus.pdu import (
+    FIFO_MAX,
     TABLE_OF,
     ExceptionCode,
     MaskWriteRequest,
@@ -41,7 +42,6 @@ READING: Final = frozenset({1, 2, 3, 4, 24, 43})
 WRITING: Final = frozenset({5, 6, 15, 16, 22, 23})
 READ_FIFO: Final = 24
 IDENTIFY: Final = 43
-FIFO_MAX: Final = 31  # registers, section 6.18
 
 
 @dataclass

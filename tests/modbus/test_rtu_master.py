@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import pytest
 
 from gateway.modbus.framing import (
+    FALSE_STARTS_MAX,
     Frame,
     RtuReplyFramer,
 )
@@ -180,3 +181,30 @@ def test_a_start_that_promises_more_than_256_bytes_is_given_up_at_once() -> None
     longest = with_crc("02 04 FB" + " 5A" * 251)
     assert len(longest) == 256
     assert answered([longest], awaiting()) == [frame_of(longest)]
+
+
+def test_a_reply_is_found_behind_so_many_false_starts_and_no_more() -> None:
+    false_start = b"\x02\x04\xff"  # the awaited unit and function, and more bytes than a frame has
+    framer = awaiting()
+    assert answered([false_start * (FALSE_STARTS_MAX - 1) + VOLTAGES], framer) == [MEASURED]
+    assert framer.damaged == FALSE_STARTS_MAX - 1
+    framer = awaiting()
+    assert answered([false_start * FALSE_STARTS_MAX + VOLTAGES, VOLTAGES], framer) == []
+    assert (framer.pending, framer.damaged) == (0, FALSE_STARTS_MAX)
+
+
+def test_false_starts_are_counted_over_all_that_comes_and_forgotten_with_the_next_question() -> None:
+    framer = awaiting()
+    assert answered([damaged(VOLTAGES)] * FALSE_STARTS_MAX, framer) == []
+    assert answered([VOLTAGES], framer) == []
+    framer.expect(2, 4)
+    assert answered([VOLTAGES], framer) == [MEASURED]
+
+
+def test_a_silence_behind_a_false_start_counts_as_one_too() -> None:
+    framer = awaiting()
+    for _ in range(FALSE_STARTS_MAX):
+        assert answered([b"\x02\x04\x0c"], framer) == []
+        framer.silence()
+    assert (framer.pending, framer.damaged) == (0, FALSE_STARTS_MAX)
+    assert answered([VOLTAGES], framer) == []

@@ -112,9 +112,8 @@ class Liar:
             self.exception_0,
             *(serial if self.framing != "tcp" else [self.other_transaction, self.other_protocol]),
         ]  # fmt: skip
-        # A connection brings no late reply in the middle of another. On a serial line, damage that an earlier lie left
-        # behind ends the wait at once, and the line then listens for one reply time, not for two.
-        self._alone = [self.cut_off, self.half_of_it_late] if self.framing == "tcp" else [self.late]
+        # A connection brings no late reply in the middle of another.
+        self._alone = [self.cut_off, self.half_of_it_late] if self.framing == "tcp" else []
 
     def __call__(self, frame: bytes) -> Script:
         """Answer what was asked; the frame itself says only its transaction."""
