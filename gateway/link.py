@@ -300,6 +300,7 @@ class SerialSettings:
     rts_before_s: float = 0.0
     rts_after_s: float = 0.0
     discard_echo: bool = False
+    mark_errors: bool = False  # a damaged character X comes as FF 00 X, a break as FF 00 00, a real FF as FF FF
 
     @property
     def character_s(self) -> float:
@@ -384,6 +385,7 @@ def _set_format(fd: int, settings: SerialSettings) -> None:
     stop = _STOP_BITS.get(settings.stop_bits)
     wanted = termios.tcgetattr(fd)
     wanted[0] = wanted[1] = wanted[3] = 0  # raw: no flow control, no translation, no echo
+    wanted[0] |= termios.INPCK | termios.PARMRK if settings.mark_errors else 0
     wanted[2] &= ~(termios.CSIZE | termios.CSTOPB | _PARITY_MASK)
     wanted[2] |= (size or termios.CS8) | (parity or 0) | (stop or 0)
     wanted[4] = wanted[5] = speed or wanted[5]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import ipaddress
 import os
 import socket
 import threading
@@ -36,6 +37,14 @@ def set_tcp_options(connection: socket.socket) -> None:
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in _TCP_OPTIONS.items():
         connection.setsockopt(socket.IPPROTO_TCP, option, value)
+
+
+def is_allowed(host: str, networks: Sequence[str]) -> bool:
+    """Whether *host*, in digits, is in one of *networks*; in any case if there are none."""
+    address = ipaddress.ip_address(host.partition("%")[0])
+    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped:
+        address = address.ipv4_mapped
+    return not networks or any(address in ipaddress.ip_network(network) for network in networks)
 
 
 def connect_tcp(host: str, port: int, waker: Waker, clock: Clock, timeout_s: float) -> Link:

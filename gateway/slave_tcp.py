@@ -8,7 +8,6 @@ Threads: one for each ``[[slave]]``, for all its clients. ``wake`` and ``set_ena
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import logging
 import selectors
 import socket
@@ -23,12 +22,13 @@ from gateway.config import SlaveConfig
 from gateway.counters import ServeCounters
 from gateway.errors import LinkError
 from gateway.link import Waker
-from gateway.link_tcp import set_tcp_options
+from gateway.link_tcp import is_allowed, set_tcp_options
 from gateway.modbus.framing import Frame, Framer, request_framer
 from gateway.modbus.pdu import BROADCAST, ExceptionCode, exception_reply
 from gateway.modbus.server import Server, answer
 from gateway.register import DataRegister, Source, SourceKind
 from gateway.serving import STATION_ALONE, Station, count_traffic, frames_in, server_of
+from gateway.traffic import Tap
 
 RECEIVE_MAX: Final = 16384  # bytes taken from a client at once
 NO_DESCRIPTOR_PAUSE_S: Final = 0.5
@@ -51,6 +51,11 @@ class Client:
     unsent: bytearray = field(default_factory=bytearray)
     listening_to: int = selectors.EVENT_READ
 
+    @property
+    def counters(self) -> ServeCounters:
+        """What it asked and was answered."""
+        return self.server.counters
+
 
 class TcpSlave:
     """One ``[[slave]]`` on TCP, all its clients in one thread; a ``Task``."""
@@ -71,6 +76,7 @@ class TcpSlave:
         self.enabled = config.enabled
         self.ready = threading.Event()
         self.server = server_of(config, register, station)
+        self.traffic = Tap(config.framing_used, clock, config.character_timeout_used, config.unit)
         self.clients: dict[int, Client] = {}
         self.refused_clients = 0
         self.port: int | None = None  # that is listened on; None while it is not
@@ -78,7 +84,6 @@ class TcpSlave:
         self._waker = waker
         self._listen = listen
         self._wait_limit_s = wait_limit_s
-        self._allow = [ipaddress.ip_network(network) for network in config.allow]
         self._opening = Backoff(config.name, clock)
         self._listener: socket.socket | None = None
         self._selector = selectors.DefaultSelector()
@@ -195,7 +200,7 @@ class TcpSlave:
             self._make_room(error)
             return
         host, port = address[0], address[1]
-        if not self._is_allowed(host):
+        if not is_allowed(host, self.config.allow):
             self.refused_clients += 1
             log.warning("%s: %s is not in the allowed networks", self.name, host)
             connection.close()
@@ -211,12 +216,6 @@ class TcpSlave:
             self._close(min(self.clients.values(), key=lambda c: c.active_s), "there are no descriptors left")
         else:
             self._waker.wait(NO_DESCRIPTOR_PAUSE_S)
-
-    def _is_allowed(self, host: str) -> bool:
-        address = ipaddress.ip_address(host.partition("%")[0])
-        if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped:
-            address = address.ipv4_mapped
-        return not self._allow or any(address in network for network in self._allow)
 
     def _welcome(self, connection: socket.socket, name: str) -> None:
         connection.setblocking(False)
@@ -235,6 +234,7 @@ class TcpSlave:
         del self.clients[client.connection.fileno()]
         self._selector.unregister(client.connection)
         client.connection.close()
+        self.traffic.ended(client.name)
 
     def _serve(self, client: Client, events: int) -> None:
         try:
@@ -257,6 +257,7 @@ class TcpSlave:
         if not data:
             return False
         client.active_s = self._clock.monotonic()
+        self.traffic.tell(False, data, client.name)
         client.framer.receive_data(data)
         client.framer.silence()
         frames = frames_in(client.framer)
@@ -308,7 +309,10 @@ class TcpSlave:
         """Send what the client takes; while it takes too little it is not listened to."""
         if client.unsent:
             with contextlib.suppress(BlockingIOError):
-                del client.unsent[: client.connection.send(client.unsent)]
+                sent = client.connection.send(client.unsent)
+                if self.traffic.is_watched:
+                    self.traffic.tell(True, bytes(client.unsent[:sent]), client.name)
+                del client.unsent[:sent]
         wanted = selectors.EVENT_READ if len(client.unsent) < UNSENT_MAX else 0
         wanted |= selectors.EVENT_WRITE if client.unsent else 0
         if wanted != client.listening_to:

@@ -11,6 +11,7 @@ import os
 import select
 import signal
 import stat
+import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator
@@ -226,6 +227,17 @@ def test_the_limit_of_a_write_ends_even_if_time_jumps(pty: Pty, line: Descriptor
     line.write_grace_s = -1000.0
     with pytest.raises(LinkLost, match="does not take data"):
         line.write(bytes(1_000_000))
+
+
+def test_with_errors_marked_a_real_ff_is_not_taken_for_a_mark(pty: Pty, waker: Waker) -> None:
+    with contextlib.closing(ports.open_serial(pty.settings(mark_errors=True), waker, CLOCK)) as link:
+        os.write(pty.wire, b"a\xffb\0")
+        assert link.read(PATIENCE_S) == b"a\xff\xffb\0"  # termios(3), PARMRK
+        flags = termios.tcgetattr(pty.near)[0]
+        assert flags == termios.INPCK | termios.PARMRK
+    with contextlib.closing(ports.open_serial(pty.settings(), waker, CLOCK)) as link:
+        os.write(pty.wire, b"a\xffb\0")
+        assert link.read(PATIENCE_S) == b"a\xffb\0"
 
 
 # --- losing the link
