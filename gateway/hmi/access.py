@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gateway.clock import Clock
+from gateway.hmi.wording import N_
 
 PASSWORD_MIN, PASSWORD_MAX = 8, 64  # characters
 
@@ -72,13 +73,13 @@ def is_hash(stored: str) -> bool:
 
 
 def password_problem(text: str) -> str | None:
-    """Return what is wrong with *text* as a new password, for people; None if nothing is."""
+    """Return what is wrong with *text* as a new password, in English, to be translated; None if nothing is."""
     if len(text) < PASSWORD_MIN:
-        return "a password has at least 8 characters"
+        return N_("a password has at least 8 characters")
     if len(text) > PASSWORD_MAX:
-        return "a password has at most 64 characters"
+        return N_("a password has at most 64 characters")
     if not text.isprintable():  # it could not be typed
-        return "a password has only characters that can be typed and shown"
+        return N_("a password has only characters that can be typed and shown")
     return None
 
 
