@@ -19,7 +19,7 @@ from typing import Final
 from gateway.clock import Clock
 from gateway.errors import QueueFull
 from gateway.modbus.pdu import Span
-from gateway.register import NEVER_S, CommandSink, DataRegister, Quality, Source, runs
+from gateway.register import COMMANDED, NEVER_S, RESTORED, CommandSink, DataRegister, Quality, Source, runs
 
 QUEUE_LIMIT: Final = 100  # commands of one master that wait
 
@@ -82,9 +82,17 @@ class CommandQueue(CommandSink):
         register.add_sink(self)
 
     def add(self, outlet: Outlet) -> None:
-        """Have writes to the outlet's span make commands, or hold its points."""
+        """Have writes to the outlet's span make commands, or hold its points.
+
+        What was a command before a restart is no command now; but what a cyclic request sends is held until it has
+        been delivered: else the first poll would overwrite a setpoint with what the device was switched on with.
+        """
         with self._register.lock:
             self._outlets.append(outlet)
+            if not outlet.on_change:
+                points = self._register.points_locked(outlet.span.table)
+                restored = [p for p in range(outlet.span.start, outlet.span.stop) if points.source[p] is RESTORED]
+                self._hold(outlet, [p for p in restored if points.commanded[p] == COMMANDED], self._number)
 
     def close(self) -> None:
         """Forget every command and let go of every point; what a command was to deliver becomes bad."""
@@ -251,7 +259,10 @@ class CommandQueue(CommandSink):
             for point in self._register.unfilled_locked(points, outlet.span):
                 is_taken = point not in outlet.pending and point not in outlet.dropped
                 if is_taken and points.quality[point] == Quality.BAD:
-                    points.quality[point] = Quality.GOOD if points.time_s[point] > NEVER_S else Quality.NEVER
+                    is_written = points.time_s[point] > NEVER_S
+                    is_old = points.source[point] is RESTORED
+                    good = Quality.STALE if is_old else Quality.GOOD
+                    points.quality[point] = good if is_written else Quality.NEVER
 
     def waiting(self) -> set[Outlet]:
         """Return the outlets that have commands in the queue."""

@@ -74,9 +74,6 @@ def cross_check(config: Config, known: Known = EVERYTHING_KNOWN) -> list[Finding
 def not_yet(config: Config) -> list[Finding]:
     """Return a warning for everything in *config* that this version accepts and does not carry out."""
     asked: list[tuple[Path, bool]] = [
-        (("register", "retain"), bool(config.register_.retain)),
-        (("hmi", "serial"), bool(config.hmi.serial.line)),
-        (("hmi", "telnet"), "telnet" in config.hmi.model_fields_set and bool(config.hmi.telnet.listen)),
         (("hmi", "wifly"), bool(config.hmi.wifly.line)),
         (("watchdog", "device"), bool(config.watchdog.device)),
     ]
@@ -464,6 +461,8 @@ def _access(config: Config, known: Known) -> Iterator[Finding]:
         yield Finding(("hmi", "telnet", "listen"), text)
     if hmi.wifly.line:
         yield Finding(("hmi", "wifly", "line"), f"line {hmi.wifly.line}: a menu over WiFi {remedy}")
+    if hmi.serial.password_required and hmi.serial.line:
+        yield Finding(("hmi", "serial", "password_required"), f"password_required true {remedy}")
 
 
 def _is_loopback(host: str) -> bool:

@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from math import inf
 from typing import Final
 
 from gateway.clock import Clock
@@ -27,7 +28,8 @@ from gateway.modbus.pdu import Span, Table
 
 SIZE_DEFAULT: Final = 2000
 SIZE_MAX: Final = 65536
-NEVER_S: Final = -1.0  # time of last update of a point that was never written
+NEVER_S: Final = -inf  # time of last update of a point that was never written; of a retained one it may be below 0
+LONG_AGO_S: Final = -1e15  # the same of a retained one whose age nobody knows
 COMMANDED: Final = 1  # the upper side, a person or a retained value wrote it
 STAND_IN: Final = 2  # zero for a failed poll, not what the device has
 
@@ -38,7 +40,7 @@ class Quality(IntEnum):
     NEVER = 0  # nothing was written yet
     GOOD = 1
     BAD = 2  # its request fails
-    STALE = 3  # older than its stale_after; told when read, never stored
+    STALE = 3  # older than its stale_after, which is found out when read; or retained, and not written since
     MANUAL = 4  # set by a person
 
 
@@ -67,9 +69,12 @@ class Source:
         return self.name
 
 
+RESTORED: Final = Source(SourceKind.RETAINED, "before the restart")
+
+
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One point for a person: value 0 or 1, or 0 to 65535; age in seconds, None before the first write."""
+    """One point for a person: value 0 or 1, or 0 to 65535; age in seconds, None where nobody knows it."""
 
     value: int
     quality: Quality
@@ -94,6 +99,20 @@ class Claim:
     span: Span
     source: Source
     stale_after_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What is to be known after a restart of points that are alike, last written *age_s* ago (None: who knows).
+
+    values:       a big-endian word, or the character 0 or 1, for each point.
+    is_commanded: the upper side or a person wrote them at some time: they are not only what a device said.
+    """
+
+    span: Span
+    values: bytes
+    age_s: float | None
+    is_commanded: bool
 
 
 class CommandSink:
@@ -123,6 +142,7 @@ class _Points:
     """One table. ``values`` has *width* bytes a point: a big-endian word, or the character 0 or 1 for a bit."""
 
     def __init__(self, table: Table, size: int) -> None:
+        self.table = table
         self.size = size
         self.width = 1 if table.is_bits else 2
         self.values = bytearray(b"0" * size if table.is_bits else 2 * size)
@@ -132,6 +152,15 @@ class _Points:
         self.commanded = bytearray(size)  # COMMANDED, STAND_IN, or 0
         self.held: dict[int, int] = {}  # point: how many commands are on their way to a device
         self.claims: list[Claim] = []
+
+    def resize(self, size: int) -> None:
+        """Cut off points, or add some that were never written."""
+        fresh = _Points(self.table, max(0, size - self.size))
+        for name in ("values", "quality", "time_s", "source", "commanded"):
+            kept = getattr(self, name)
+            del kept[size * (self.width if name == "values" else 1) :]
+            kept.extend(getattr(fresh, name))
+        self.size = size
 
     def unpack(self, span: Span, data: bytes) -> bytes:
         """Return wire *data* as ``values`` keeps it."""
@@ -187,19 +216,30 @@ class DataRegister:
         """Return how many points *table* has."""
         return self._tables[table].size
 
+    def resize(self, sizes: Mapping[Table, int]) -> None:
+        """Give each table its new size; the points that remain keep all that is known of them, new ones are 0.
+
+        Nobody may claim or hold a point beyond the new end. Raises RequestInvalid, and nothing has changed.
+        """
+        for table, size in sizes.items():
+            if not 1 <= size <= SIZE_MAX:
+                raise RequestInvalid(f"{size} points in table {table} are not within 1 to {SIZE_MAX}")
+        with self._lock:
+            for table, size in sizes.items():
+                self._tables[table].resize(size)
+
     # -------------------------------------------------------------------------------------------- reading
 
     def read(self, span: Span) -> bytes:
         """Return the block as on the wire: big-endian words or packed bits. Raises PointsOutOfRange."""
-        points = self._demand(span)
         with self._lock:
-            return points.wire(span.start, span.stop)
+            return self._demand(span).wire(span.start, span.stop)
 
     def read_fresh(self, span: Span) -> bytes | None:
         """Return the block like ``read``, or None if a point that a request fills is bad, stale or never read."""
-        points = self._demand(span)
         now_s = self._clock.monotonic()
         with self._lock:
+            points = self._demand(span)
             for claim in points.claims:
                 if claim.span.overlaps(span) and not _is_fresh(points, claim, span, now_s):
                     return None
@@ -207,9 +247,9 @@ class DataRegister:
 
     def samples(self, span: Span) -> list[Sample]:
         """Return one Sample a point: for people, not for the hot path. Raises PointsOutOfRange."""
-        points = self._demand(span)
         now_s = self._clock.monotonic()
         with self._lock:
+            points = self._demand(span)
             limits = _stale_limits(points, span)
             return [_sample(points, point, now_s, limits.get(point)) for point in range(span.start, span.stop)]
 
@@ -218,9 +258,8 @@ class DataRegister:
 
         commanded: at least one of them by the upper side, a person or a retained value, and no zero for a failed poll.
         """
-        points = self._demand(span)
         with self._lock:
-            return self.known_locked(points, span, commanded)
+            return self.known_locked(self._demand(span), span, commanded)
 
     @staticmethod
     def known_locked(points: _Points, span: Span, commanded: bool) -> bytes | None:
@@ -240,12 +279,11 @@ class DataRegister:
         commands it makes, or is refused whole.
         raises: PointsOutOfRange, RequestInvalid (wrong size), QueueFull; nothing was stored then.
         """
-        points = self._demand(span)
-        if len(data) != span.size:
-            raise RequestInvalid(f"{span.count} points take {span.size} bytes, not {len(data)}")
-        raw = points.unpack(span, data)
         with self._lock:
-            woken = self._write_locked(points, span, raw, source, quality)
+            points = self._demand(span)
+            if len(data) != span.size:
+                raise RequestInvalid(f"{span.count} points take {span.size} bytes, not {len(data)}")
+            woken = self._write_locked(points, span, points.unpack(span, data), source, quality)
         self._tell(woken)
 
     def mask_write(self, span: Span, and_mask: int, or_mask: int, source: Source) -> None:
@@ -253,8 +291,8 @@ class DataRegister:
 
         raises: as ``write`` does; PointUnknown where a value that nobody knows would go to a device.
         """
-        points = self._demand(span)
         with self._lock:
+            points = self._demand(span)
             is_unknown = points.time_s[span.start] == NEVER_S or points.commanded[span.start] == STAND_IN
             if is_unknown and any(sink.wants(span) for sink in self._sinks):
                 raise PointUnknown(f"nobody knows point {span.start} yet: a part of it cannot be sent to its device")
@@ -266,14 +304,13 @@ class DataRegister:
     def mark(self, span: Span, quality: Quality, source: Source) -> None:
         """Set the quality of a failed poll's points; values, times and sources stay."""
         del source  # of interest to readers of the call; the points keep the source of their value
-        points = self._demand(span)
         with self._lock:
-            points.quality[span.start : span.stop] = bytes([quality]) * span.count
+            self._demand(span).quality[span.start : span.stop] = bytes([quality]) * span.count
 
     def mark_unfilled(self, span: Span, quality: Quality) -> None:
         """Like ``mark``, but only the points that no request fills: a failed write says nothing of what is read."""
-        points = self._demand(span)
         with self._lock:
+            points = self._demand(span)
             for point in self.unfilled_locked(points, span):
                 points.quality[point] = quality
 
@@ -285,9 +322,9 @@ class DataRegister:
 
     def claim(self, span: Span, source: Source, stale_after_s: float) -> Callable[[], None]:
         """Say that *source* fills *span*, and from what age its values are stale. Returns its own undo."""
-        points = self._demand(span)
         claim = Claim(span, source, stale_after_s)
         with self._lock:
+            points = self._demand(span)
             points.claims.append(claim)
 
         def undo() -> None:
@@ -306,6 +343,38 @@ class DataRegister:
                 self._watchers.remove(told)
 
         return undo
+
+    # -------------------------------------------------------------------------------------------- over a restart
+
+    def copy_of_known(self, table: Table) -> _Points:
+        """Return a copy of *table* without its qualities and sources: bare memory, for the lock is held meanwhile."""
+        copied = _Points(table, 0)
+        with self._lock:
+            points = self._tables[table]
+            copied.size = points.size
+            copied.values, copied.time_s, copied.commanded = points.values[:], points.time_s[:], points.commanded[:]
+        return copied
+
+    def restore(self, blocks: Sequence[Kept]) -> None:
+        """Fill points that nobody has written yet, as far as there are such; then tell the watchers.
+
+        They are stale until somebody writes them; those that were a command are one again, but none is queued now.
+        """
+        with self._lock:
+            for block in blocks:
+                points, first = self._tables[block.span.table], block.span.start
+                never = [p for p in range(first, min(block.span.stop, points.size)) if points.time_s[p] == NEVER_S]
+                for start, stop in runs(never):
+                    raw = block.values[(start - first) * points.width : (stop - first) * points.width]
+                    self._restore(points, start, raw, block)
+        self._tell([])
+
+    def _restore(self, points: _Points, start: int, raw: bytes, block: Kept) -> None:
+        count = len(raw) // points.width
+        time_s = LONG_AGO_S if block.age_s is None else self._clock.monotonic() - block.age_s
+        self._store(points, Span(block.span.table, start, count), raw, RESTORED, Quality.STALE)
+        points.time_s[start : start + count] = array("d", [time_s]) * count
+        points.commanded[start : start + count] = bytes([COMMANDED if block.is_commanded else 0]) * count
 
     # -------------------------------------------------------------------------------------------- for commands.py
 
@@ -331,6 +400,7 @@ class DataRegister:
     # -------------------------------------------------------------------------------------------- inside
 
     def _demand(self, span: Span) -> _Points:
+        """Return the table of *span* to whoever holds the lock: its size may change."""
         points = self._tables[span.table]
         if span.start < 0 or span.count < 1 or span.stop > points.size:
             raise PointsOutOfRange(f"points {span.start} to {span.stop - 1} are not within 0 to {points.size - 1}")
@@ -393,7 +463,7 @@ class DataRegister:
 def _is_fresh(points: _Points, claim: Claim, span: Span, now_s: float) -> bool:
     start, stop = max(span.start, claim.span.start), min(span.stop, claim.span.stop)
     quality = points.quality[start:stop]
-    if Quality.BAD in quality or Quality.NEVER in quality:
+    if Quality.BAD in quality or Quality.NEVER in quality or Quality.STALE in quality:
         return False
     return now_s - min(points.time_s[start:stop]) <= claim.stale_after_s  # as in _sample, to the last bit
 
@@ -412,8 +482,13 @@ def _sample(points: _Points, point: int, now_s: float, stale_after_s: float | No
     raw = points.values[point * points.width : (point + 1) * points.width]
     value = raw[0] & 1 if points.width == 1 else int.from_bytes(raw, "big")
     quality = Quality(points.quality[point])
-    age_s = None if points.time_s[point] == NEVER_S else now_s - points.time_s[point]
+    age_s = age_s_of(points.time_s[point], now_s)
     old = age_s is not None and stale_after_s is not None and age_s > stale_after_s
     if old and quality in (Quality.GOOD, Quality.MANUAL):
         quality = Quality.STALE
     return Sample(value, quality, age_s, points.source[point])
+
+
+def age_s_of(time_s: float, now_s: float) -> float | None:
+    """Return how long ago *time_s* was; None where nobody knows."""
+    return None if time_s <= LONG_AGO_S else now_s - time_s

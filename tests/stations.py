@@ -6,9 +6,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from gateway.clock import SystemClock
 from gateway.register import DataRegister
+from gateway.retained import RetainedFile
 from gateway.store import load_text
 from gateway.supervisor import Supervisor
 from gateway.wiring import build
@@ -37,9 +39,10 @@ class RunningStation:
 
 
 @contextmanager
-def running_station(text: str) -> Iterator[RunningStation]:
+def running_station(text: str, retained: Path | None = None) -> Iterator[RunningStation]:
+    """*retained*: the file through which values survive a restart."""
     clock = SystemClock()
-    station = build(load_text(text, "test.toml").config, clock)
+    station = build(load_text(text, "test.toml").config, clock, RetainedFile(retained) if retained else None)
     supervisor = Supervisor(station.plans, clock)
     started = threading.Event()
     clean: list[bool] = []

@@ -329,10 +329,7 @@ def test_polls_that_do_not_fit_their_line_are_a_warning() -> None:
 @pytest.mark.parametrize(
     ("data", "path"),
     [
-        ({"register": {"retain": ["coils"]}}, ("register", "retain")),
         ({"io": [IO]}, ("io", 0)),
-        ({"hmi": {"serial": {"line": "/dev/ttyS3"}}}, ("hmi", "serial")),
-        ({"hmi": {"telnet": {}}}, ("hmi", "telnet")),
         ({"hmi": {"wifly": {"line": "/dev/ttyS0"}}}, ("hmi", "wifly")),
         ({"watchdog": {"device": "/dev/watchdog"}}, ("watchdog", "device")),
     ],

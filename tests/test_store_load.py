@@ -128,7 +128,7 @@ def test_the_full_file_loads_with_its_text_and_what_is_not_carried_out_yet() -> 
     loaded = load_text(FULL, "full.toml")
     assert loaded.config == Config.model_validate(tomllib.loads(FULL))
     assert loaded.text == FULL
-    assert [(one.subject, one.severity) for one in loaded.findings] == [('io "door"', "warning"), ("[hmi]", "warning")]
+    assert [(one.subject, one.severity) for one in loaded.findings] == [('io "door"', "warning")]
 
 
 def test_a_finding_about_what_is_not_in_the_file_has_no_line() -> None:
