@@ -15,21 +15,20 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Any, Final, TextIO
 
 from gateway import __version__
 from gateway.clock import SystemClock
-from gateway.config import Config, MasterConfig
+from gateway.config import MasterConfig
 from gateway.config_fields import escaped
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, GatewayError, SaveError
 from gateway.line_load import line_load
-from gateway.store import NAME_CHARACTERS, Loaded, load
-from gateway.supervisor import Supervisor
-from gateway.wiring import build
+from gateway.store import NAME_CHARACTERS, Loaded, load, read
 
 CONFIG_DEFAULT: Final = "/etc/rtugate/rtugate.toml"
 STATE_DEFAULT: Final = "/var/lib/rtugate"
 DEMO_PORT: Final = 5020
+READABLE: Final = 0o644  # mode of a file without secrets
 SIGNALS: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 SWITCH_INTERVAL_S: Final = 0.0005  # how long a slave's answer may wait for another thread that computes
 
@@ -90,9 +89,19 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     run = commands.add_parser("run", parents=[common], help="the gateway, in the foreground; SIGTERM stops it")
     run.set_defaults(command=_run)
+    menu = commands.add_parser("menu", parents=[common], help="the menu of the gateway that runs, in this terminal")
+    menu.set_defaults(command=_menu)
+    passwd = commands.add_parser("passwd", parents=[common], help="set the password that telnet asks for")
+    passwd.set_defaults(command=_passwd)
+    history = commands.add_parser("history", parents=[common], help="the configurations that were saved last")
+    history.set_defaults(command=_history)
+    rollback = commands.add_parser("rollback", parents=[common], help="go back to one of them, and have it run")
+    rollback.add_argument("number", metavar="N", type=_positive_integer, help="its number in `rtugate history`")
+    rollback.set_defaults(command=_rollback)
     check = commands.add_parser("check", parents=[common], help="validate a configuration, show each line's load")
     check.add_argument("file", metavar="FILE", nargs="?", help="instead of -c FILE")
     check.set_defaults(command=_check)
+    _add_documents(commands, common)
     demo = commands.add_parser("demo", parents=[common], help="simulated devices and the gateway; needs no hardware")
     demo.add_argument(
         "--seconds", metavar="N", type=_positive, help="end after N seconds with a verdict (10 is enough)"
@@ -103,6 +112,19 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_documents(commands: Any, common: argparse.ArgumentParser) -> None:
+    """Add `init`, `show` and `schema`. *commands*: what ``add_subparsers`` returned, a type without a public name."""
+    init = commands.add_parser("init", parents=[common], help="write a commented file to start from, and its schema")
+    init.add_argument("file", metavar="FILE", nargs="?", help="instead of -c FILE")
+    init.add_argument("--force", action="store_true", help="keep a file that is there as FILE.replaced-DATE")
+    init.set_defaults(command=_init)
+    show = commands.add_parser("show", parents=[common], help="every key with the value in effect, without secrets")
+    show.add_argument("file", metavar="FILE", nargs="?", help="instead of -c FILE")
+    show.set_defaults(command=_show)
+    schema = commands.add_parser("schema", parents=[common], help="the JSON Schema of the file, for editors")
+    schema.set_defaults(command=_schema)
+
+
 def _common_options(config: str, state: str) -> argparse.ArgumentParser:
     """What belongs to every command, before or behind it, with these defaults; the last one counts."""
     options = argparse.ArgumentParser(add_help=False)
@@ -111,7 +133,7 @@ def _common_options(config: str, state: str) -> argparse.ArgumentParser:
         "--state",
         metavar="DIR",
         default=state,
-        help=f"state directory, not used yet; default: $STATE_DIRECTORY, else {STATE_DEFAULT}",
+        help=f"state directory; default: $STATE_DIRECTORY, else {STATE_DEFAULT}",
     )
     return options
 
@@ -121,6 +143,13 @@ def _positive(text: str) -> float:
     if not 0 < seconds < 1e9:
         raise ValueError(text)
     return seconds
+
+
+def _positive_integer(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise ValueError(text)
+    return number
 
 
 def _port(text: str) -> int:
@@ -134,49 +163,136 @@ def _port(text: str) -> int:
 
 
 def _run(parsed: argparse.Namespace) -> int:
+    from gateway.service import run_service  # other commands do not pay for it
+
     path = Path(parsed.config)
     if _is_missing(path):
         return _no_such_file(path)
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # one that comes early waits until it can be heeded
-    logging.basicConfig(format="%(levelname)s %(message)s", stream=sys.stderr)
-    config = _usable(path)
-    log.setLevel(config.log.level.upper())
-    clock = SystemClock()
-    supervisor = Supervisor(build(config, clock).plans, clock)
-    _stop_on_signals(supervisor.stop)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    log.info("rtugate %s runs: %d masters, %d slaves", __version__, len(config.master), len(config.slave))
-    is_clean = supervisor.run()
-    log.info("stopped")
-    return 0 if is_clean else 1
+    return run_service(path, Path(parsed.state), _control_path(parsed))
 
 
-def _usable(path: Path) -> Config:
-    """Return the configuration in *path*; where it cannot be used, say why and go on with nothing switched on."""
+def _control_path(parsed: argparse.Namespace) -> Path:
+    """Where the control socket of the gateway is, or is to be."""
+    return Path(os.environ.get("RUNTIME_DIRECTORY") or parsed.state) / "control"
+
+
+def _menu(parsed: argparse.Namespace) -> int:
+    from gateway.hmi.client import run_menu
+
+    return run_menu(_control_path(parsed), sys.stdin.fileno(), sys.stdout.fileno())
+
+
+# ------------------------------------------------------------------------------------------------ the file
+
+
+def _passwd(parsed: argparse.Namespace) -> int:
+    from gateway.edits import set_password
+
+    path = Path(parsed.config)
+    if _is_missing(path):
+        return _no_such_file(path)
+    return _tell(lambda: set_password(path, _control_path(parsed)))
+
+
+def _history(parsed: argparse.Namespace) -> int:
+    from gateway.edits import history
+
+    return _tell(lambda: history(Path(parsed.state)))
+
+
+def _rollback(parsed: argparse.Namespace) -> int:
+    from gateway.edits import rollback
+
+    return _tell(lambda: rollback(Path(parsed.config), Path(parsed.state), _control_path(parsed), parsed.number))
+
+
+def _init(parsed: argparse.Namespace) -> int:
+    return _tell(lambda: _start_file(_file_of(parsed), parsed.force))
+
+
+def _start_file(path: Path, is_forced: bool) -> list[str]:
+    """Write a file to start from, and its schema beside it; return what to tell. Raises GatewayError."""
+    from gateway import documents, files, save
+
+    content = _content(path)
+    text, schema = documents.starting_file().encode(), path.with_name(documents.SCHEMA_NAME)
+    if path == schema:
+        raise SaveError(f"rtugate: {_shown(path)}: the schema is called so: take another name")
+    if content is not None and not is_forced:
+        raise SaveError(
+            f"rtugate: {_shown(path)}: this file exists: --force keeps it under another name and writes a new one"
+        )
+    kept = "" if content in (None, text) else save.keep_beside(path, "replaced", SystemClock().wall()).name
+    files.write_atomically(schema, documents.schema_text().encode(), READABLE)
+    files.write_atomically(path, text)
+    return [
+        f"{_shown(path)}: written" + (f"; what was there is now {escaped(kept, NAME_CHARACTERS)}" if kept else ""),
+        f"{_shown(schema)}: written; editors (VS Code with Even Better TOML) explain and check each key by it",
+        "edit the file, then `rtugate check` says what is wrong with it",
+    ]
+
+
+def _content(path: Path) -> bytes | None:
+    """What the file at *path* says, None where there is none. Raises GatewayError, also for what is no file."""
+    from gateway.files import in_words
+
     try:
-        loaded = load(path)
+        return read(path)
+    except FileNotFoundError as error:
+        if not path.parent.is_dir():
+            raise SaveError(f"rtugate: {_shown(path)}: its folder does not exist") from error
+        return None
+    except OSError as error:
+        raise SaveError(f"rtugate: {_shown(path)}: {in_words(error, path)}") from error
+
+
+def _tell(work: Callable[[], list[str]]) -> int:
+    """Print what *work* has to tell; 1 where it cannot be done."""
+    try:
+        for line in work():
+            print(line)
+    except GatewayError as error:
+        _complain(*str(error).splitlines())
+        return 1
+    return 0
+
+
+# ------------------------------------------------------------------------------------------------ show, schema
+
+
+def _show(parsed: argparse.Namespace) -> int:
+    from gateway.documents import effective_text
+
+    path = _file_of(parsed)
+    if _is_missing(path):
+        return _no_such_file(path)
+    try:
+        config = load(path).config
     except ConfigError as error:
-        for finding in error.findings:
-            log.error("%s", finding)
-        log.error("%s cannot be used: running with factory settings, no line is polled or served", _shown(path))
-        return Config()
-    for finding in loaded.findings:
-        log.log(logging.INFO if finding.severity == "note" else logging.WARNING, "%s", finding)
-    return loaded.config
+        _complain(*error.findings)
+        return 1
+    _print_document(effective_text(config, path.name))
+    return 0
 
 
-def _stop_on_signals(stop: Callable[[], None]) -> None:
-    signal.signal(signal.SIGTERM, lambda *_: stop())
-    signal.signal(signal.SIGINT, lambda *_: stop())
-    signal.signal(signal.SIGHUP, lambda *_: log.warning("reloading is not there yet: restart to use a new file"))
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+def _schema(_parsed: argparse.Namespace) -> int:
+    from gateway.documents import schema_text
+
+    _print_document(schema_text())
+    return 0
+
+
+def _print_document(text: str) -> None:
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(encoding="utf-8")  # as TOML and JSON are, whatever the terminal speaks
+    print(text, end="")
 
 
 # ------------------------------------------------------------------------------------------------ check
 
 
 def _check(parsed: argparse.Namespace) -> int:
-    path = Path(parsed.config if parsed.file is None else parsed.file)
+    path = _file_of(parsed)
     if _is_missing(path):
         return _no_such_file(path)
     try:
@@ -216,6 +332,10 @@ def _demo(parsed: argparse.Namespace) -> int:
 
 
 # ------------------------------------------------------------------------------------------------ files
+
+
+def _file_of(parsed: argparse.Namespace) -> Path:
+    return Path(parsed.config if parsed.file is None else parsed.file)
 
 
 def _is_missing(path: Path) -> bool:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,15 +64,19 @@ def shell(arguments: str, **environment: str) -> subprocess.CompletedProcess[str
 
 @contextmanager
 def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """Run `rtugate` until the block ends; what it said is in ``process.said``."""
+    """Run `rtugate`, with a state directory of its own, until the block ends."""
     command = [sys.executable, "-m", "gateway", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+    with tempfile.TemporaryDirectory() as state:
+        environment = {**os.environ, "STATE_DIRECTORY": state, "RUNTIME_DIRECTORY": state}
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+        )
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
 
 
 def wait_for_line(process: subprocess.Popen[str], words: str) -> str:
@@ -198,6 +205,114 @@ def test_output_into_a_closed_pipe_is_no_traceback(file: Path) -> None:
     assert "Traceback" not in ended.stderr
 
 
+# ------------------------------------------------------------------------------------------------ init, show, schema
+
+
+def test_init_writes_a_file_that_check_finds_valid_and_the_schema_that_it_names(tmp_path: Path) -> None:
+    ended = rtugate("-c", "new.toml", "init", cwd=tmp_path)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.splitlines()[:1] == ["new.toml: written"]
+    assert rtugate("check", "new.toml", cwd=tmp_path).stdout.splitlines()[0] == "new.toml: valid"
+    named = (tmp_path / "new.toml").read_text().splitlines()[0].removeprefix("#:schema ")
+    assert json.loads((tmp_path / named).read_text())["properties"]["master"]["type"] == "array"
+    assert {path.name: oct(path.stat().st_mode & 0o777) for path in tmp_path.iterdir()} == {
+        "new.toml": "0o640",  # it will hold secrets
+        "rtugate.schema.json": "0o644",
+    }
+
+
+def test_init_takes_a_file_of_its_own_as_well(tmp_path: Path) -> None:
+    assert rtugate("-c", "no.toml", "init", "b.toml", cwd=tmp_path).returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.toml", "rtugate.schema.json"]
+
+
+def test_init_leaves_a_file_that_exists_alone_and_says_what_to_do(file: Path) -> None:
+    old = file.read_text()
+    ended = rtugate("init", str(file))
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr == (
+        f"rtugate: {file}: this file exists: --force keeps it under another name and writes a new one\n"
+    )
+    assert file.read_text() == old
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_init_by_force_keeps_the_old_file_beside(file: Path) -> None:
+    old = file.read_text()
+    ended = rtugate("init", "--force", str(file))
+    assert ended.returncode == 0
+    (kept,) = file.parent.glob("rtugate.toml.replaced-*")
+    assert ended.stdout.splitlines()[0] == f"{file}: written; what was there is now {kept.name}"
+    assert kept.read_text() == old
+    assert file.read_text().startswith("#:schema ")
+
+
+def test_init_by_force_keeps_nothing_that_it_writes_again(file: Path) -> None:
+    file.unlink()
+    for _ in range(2):
+        assert rtugate("init", "--force", str(file)).stdout.splitlines()[0] == f"{file}: written"
+    assert sorted(path.name for path in file.parent.iterdir()) == ["rtugate.schema.json", "rtugate.toml"]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("no/new.toml", "rtugate: no/new.toml: its folder does not exist"),
+        ("rtugate.toml/new.toml", "rtugate: rtugate.toml/new.toml: its folder is no folder"),
+        ("fifo", "fifo: is not a regular file"),
+        (".", "rtugate: .: Is a directory"),
+        ("", "rtugate: .: Is a directory"),
+        ("rtugate.schema.json", "rtugate: rtugate.schema.json: the schema is called so: take another name"),
+    ],
+)
+def test_init_where_no_file_can_be_is_one_line(file: Path, name: str, said: str) -> None:
+    os.mkfifo(file.parent / "fifo")
+    ended = rtugate("init", "--force", name, cwd=file.parent)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", f"{said}\n")
+    assert sorted(path.name for path in file.parent.iterdir()) == ["fifo", "rtugate.toml"]
+
+
+def test_show_prints_what_is_in_effect_and_check_finds_it_valid(file: Path) -> None:
+    ended = rtugate("show", str(file))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert 'name = "boiler"\nenabled = true\nunit = 17\nfunction = "read-holding-registers"\n' in ended.stdout
+    assert rtugate("show", "-c", str(file)).stdout == ended.stdout
+    file.write_text(ended.stdout)
+    assert rtugate("check", str(file)).stdout.splitlines()[0] == f"{file}: valid"
+
+
+def test_show_of_what_cannot_be_used_tells_every_finding_and_shows_nothing(file: Path) -> None:
+    file.write_text(file.read_text().replace("count = 100", "count = 126\nbogus = 1"))
+    ended = rtugate("show", str(file))
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr.splitlines() == [
+        'rtugate.toml:10: master "field", request "boiler": count 126 is more than 125',
+        'rtugate.toml:11: master "field", request "boiler": unknown key "bogus"',
+    ]
+    assert rtugate("show", str(file) + ".no").returncode == 2
+
+
+def test_show_shows_no_secret(file: Path) -> None:
+    file.write_text(file.read_text() + '[hmi.wifly]\npassphrase = "correct horse"\n')
+    shown = rtugate("show", str(file)).stdout
+    assert 'passphrase = "***"' in shown
+    assert "horse" not in shown
+
+
+def test_show_is_utf_8_whatever_the_terminal_speaks(file: Path) -> None:
+    file.write_text(file.read_text() + '[identity]\nvendor = "Señal"\n', encoding="utf-8")
+    out = file.with_name("shown.toml")
+    assert shell(f"show {file} >{out}", PYTHONIOENCODING="ascii").returncode == 0
+    assert tomllib.loads(out.read_text(encoding="utf-8"))["identity"]["vendor"] == "Señal"
+
+
+def test_schema_prints_what_init_writes(tmp_path: Path) -> None:
+    rtugate("init", "a.toml", cwd=tmp_path)
+    ended = rtugate("schema")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout == (tmp_path / "rtugate.schema.json").read_text()
+
+
 # ------------------------------------------------------------------------------------------------ usage
 
 
@@ -307,11 +422,11 @@ def test_run_reports_a_missing_port_once_and_goes_on(file: Path) -> None:
         assert process.wait(timeout=2.0) == 0
 
 
-def test_a_hang_up_is_logged_and_changes_nothing(file: Path) -> None:
+def test_a_hang_up_loads_the_file_anew(file: Path) -> None:
     with running("run", "-c", str(file)) as process:
         wait_for_line(process, "runs:")
         process.send_signal(signal.SIGHUP)
-        wait_for_line(process, "reloading is not there yet")
+        wait_for_line(process, "rtugate.toml: reloaded")
         process.terminate()
         assert process.wait(timeout=2.0) == 0
 
