@@ -2,6 +2,9 @@
 
     GatewayError
     ├── ConfigError             the configuration cannot be used; carries every finding
+    ├── SaveError               a file is not written; says why, and what to do
+    │   └── FileChanged         it says something else than when it was read
+    ├── HistoryError            a kept version cannot be read
     ├── RequestInvalid          a request that must not be sent or stored: caller's mistake
     │   ├── PointsOutOfRange    points that the register does not have
     │   └── PointUnknown        part of a point is to be sent whose value nobody knows
@@ -32,6 +35,18 @@ class ConfigError(GatewayError):
     def __init__(self, findings: Sequence[object]) -> None:
         super().__init__("\n".join(str(finding) for finding in findings))
         self.findings = tuple(findings)
+
+
+class SaveError(GatewayError):
+    """A file could not be written; the text says which, why and what helps, for a person."""
+
+
+class FileChanged(SaveError):
+    """The file says something else than it did when it was read: reload it, write over it, or leave it."""
+
+
+class HistoryError(GatewayError):
+    """A version that was kept cannot be listed or read; the text says which and why."""
 
 
 class RequestInvalid(GatewayError, ValueError):

@@ -2,7 +2,7 @@
 
 Loading changes nothing on the disk and never falls back to anything: a file that cannot be used is a ``ConfigError``
 that carries every finding, whatever the bytes in it. What depends on how a value is spelled is checked here, where the
-text is known. Saving is to come.
+text is known. Saving is done by ``save``.
 
 Source: specification of rtugate, section 6. Any thread; nothing is shared.
 """
@@ -81,17 +81,20 @@ def load(path: Path) -> Loaded:
     """Return the configuration in the file at *path*; raises ConfigError with every finding."""
     name = path.name or str(path)
     try:
-        content = _read(path, name)
+        content = read(path)
     except OSError as error:
         raise _unusable(name, None, f"cannot be read: {error.strerror or error}") from error
     return load_text(content, name)
 
 
-def _read(path: Path, name: str) -> bytes:
-    """Return what is in a file; nothing else is even opened, since a FIFO waits and a device may act on it."""
+def read(path: Path) -> bytes:
+    """Return what is in a file, up to a byte more than allowed; raises OSError, and ConfigError if it is no file.
+
+    Nothing but a file is even opened, since a FIFO waits and a device may act on it.
+    """
     mode = path.stat().st_mode
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # of a directory the system itself says what it is
-        raise _unusable(name, None, "is not a regular file")
+        raise _unusable(path.name or str(path), None, "is not a regular file")
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # it may have become a FIFO since
     with os.fdopen(descriptor, "rb") as file:
         return file.read(LARGEST_FILE_BYTES + 1)
@@ -105,7 +108,7 @@ def load_text(text: str | bytes, file_name: str) -> Loaded:
     statements = toml_text.scan(decoded)
     data = _parse(decoded, statements, file_name)
     config, found = validate(data)
-    confused = list(_reference_numbers(decoded, data, statements))
+    confused = [Finding(one.path, message) for one, message in reference_numbers(decoded, data, statements)]
     found += confused
     if config is None or confused:
         raise ConfigError(_locate(found, data, statements, file_name))
@@ -155,8 +158,13 @@ def _in_plain_words(text: str, document: str) -> tuple[int, str]:
     return int(place[1]), f"not TOML: {words} (column {place[2]})"
 
 
-def _reference_numbers(text: str, data: Mapping[str, Any], statements: list[toml_text.Statement]) -> Iterator[Finding]:
-    """Addresses that are spelled like a handbook's 40108; who really means that PDU address can spell it 0x9CAC."""
+def reference_numbers(
+    text: str, data: Mapping[str, Any], statements: list[toml_text.Statement]
+) -> Iterator[tuple[toml_text.Statement, str]]:
+    """Addresses that are spelled like a handbook's 40108, and what is said of each.
+
+    Who really means that PDU address can spell it 0x9CAC.
+    """
     for statement in statements:
         path = statement.path
         if len(path) != 5 or path[::2] != ("master", "request", "address"):
@@ -165,7 +173,7 @@ def _reference_numbers(text: str, data: Mapping[str, Any], statements: list[toml
             request = data["master"][path[1]]["request"][path[3]]
             found = _confused(request["address"], request.get("function"))
             if found:
-                yield Finding(path, found)
+                yield statement, found
 
 
 def _confused(number: int, function: object) -> str | None:
@@ -188,14 +196,14 @@ def _locate(
 ) -> list[LocatedFinding]:
     places = toml_text.Places(statements)
     located = [
-        LocatedFinding(file_name, places.line(one.path), _subject(one.path, data), one.message, one.severity)
+        LocatedFinding(file_name, places.line(one.path), subject(one.path, data), one.message, one.severity)
         for one in found
     ]
     return sorted(located, key=lambda finding: finding.line or 0)
 
 
-def _subject(path: config_fields.Path, data: Mapping[str, Any]) -> str:
-    """What *path* lies in, as a person names it."""
+def subject(path: config_fields.Path, data: Mapping[str, Any]) -> str:
+    """What *path* lies in, as a person names it: `master "field", request "boiler"`, `[hmi.serial]` or nothing."""
     if len(path) > 1 and isinstance(path[1], int):
         entries = [_entry_name(path[:2], data)]
         if len(path) > 3 and isinstance(path[3], int) and path[2] == "request":
