@@ -1,6 +1,7 @@
 # make demo   simulated devices, the gateway, a verdict after DEMO_SECONDS (0: until Ctrl-C)
 # make test   the tests; needs only Python (3.11 or newer, with pip and venv)
 # make check  the tests with coverage, ruff, mypy
+# make translations   the catalogues of the menu, brought up to date with the code
 # make bench  how fast it is, against a peer in the same run
 # make system-test   what takes minutes; writes tests/system/LAST.md; TESTS="FILE ..." for some of it
 
@@ -13,7 +14,7 @@ PYTEST_ARGS ?=
 BIN = $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
 
-.PHONY: demo test check bench system-test clean
+.PHONY: demo test check translations bench system-test clean
 
 demo: $(VENV)/.test
 	$(BIN)/rtugate demo $(if $(filter-out 0,$(DEMO_SECONDS)),--seconds $(DEMO_SECONDS))
@@ -29,6 +30,9 @@ check: $(VENV)/.check
 	$(BIN)/python -m coverage run -m pytest $(PYTEST_ARGS)
 	$(BIN)/python -m coverage combine --quiet
 	$(BIN)/python tests/coverage_floors.py
+
+translations: $(VENV)/.test
+	$(BIN)/python -m tests.hmi.catalogues
 
 bench: $(VENV)/.test
 	$(BIN)/python -m bench.run

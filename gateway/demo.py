@@ -11,27 +11,30 @@ from __future__ import annotations
 
 import inspect
 import sys
+import tempfile
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final, TextIO
 
 from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
 from gateway.clock import SystemClock
-from gateway.config import Config
+from gateway.config_file import ConfigFile
 from gateway.errors import LinkUnavailable
 from gateway.link_tcp import listen_tcp
+from gateway.logs import LogRing
 from gateway.modbus.pdu import Span, Table
 from gateway.register import DataRegister, Quality
+from gateway.running import Gateway
+from gateway.service import shared_of
 from gateway.simulator import Device, Simulator, demo_devices
-from gateway.store import load_text
-from gateway.supervisor import Supervisor
-from gateway.wiring import build
+from gateway.wiring import terminal_plans
 
 CONFIGURATION: Final = """\
 [[master]]                      # an RS-485 pair with two devices
@@ -94,8 +97,12 @@ point = 0
 name = "scada"
 line = "tcp://127.0.0.1:{port}"
 unit = 1
+
+[hmi.telnet]                    # the menu
+listen = "{menu}"
 """
 
+HIGHEST_PORT: Final = 65535
 LOOK_EVERY_S: Final = 0.5
 KEPT: Final = 50  # values of each device that still count as its own: 10 s
 CHANGES_WANTED: Final = 3
@@ -206,6 +213,8 @@ class Demo:
         for watched in self.watched:
             watched.follow()
             watched.device.silent = watched.device.name == silent
+        self.menu_port = port + 1 if port < HIGHEST_PORT else None
+        self.has_ended = False  # the menu's X has stopped the gateway
         self.setpoint: int | None = None
         self.register: DataRegister | None = None
 
@@ -221,31 +230,37 @@ class Demo:
         """Run devices and gateway while the caller looks at them."""
         meter, boiler, block = (watched.device for watched in self.watched)
         listen_tcp("127.0.0.1", self.port).close()  # say now, not in a log line, that the port is taken
-        with Simulator() as simulator:
+        with Simulator() as simulator, tempfile.TemporaryDirectory(prefix="rtugate-demo-") as folder:
             serial = simulator.add_serial([meter, boiler])
-            config = self.configuration(serial, simulator.add_tcp([block]))
-            clock = SystemClock()
-            station = build(config, clock)
-            self.register = station.register
-            supervisor = Supervisor(station.plans, clock)
+            gateway = self._gateway(Path(folder), serial, simulator.add_tcp([block]))
+            self.register = gateway.register
             started = threading.Event()
-            thread = threading.Thread(target=supervisor.run, args=(started.set,), name="supervisor")
+            thread = threading.Thread(target=self._run, args=(gateway, started), name="supervisor")
             scada = Scada(self.port)
             thread.start()
             try:
                 started.wait()
-                for task in supervisor.tasks.values():
+                for task in gateway.supervisor.tasks.values():
                     task.ready.wait()
                 yield scada
             finally:
                 scada.close()
-                supervisor.stop()
+                gateway.stop()
                 thread.join()
 
-    def configuration(self, serial: str, tcp: int) -> Config:
-        """Return the gateway's configuration, read from its text like any other."""
-        text = CONFIGURATION.format(serial=serial, tcp=tcp, port=self.port)
-        return load_text(text, "demo.toml").config
+    def _gateway(self, folder: Path, serial: str, tcp: int) -> Gateway:
+        """Return the gateway with its menu; what the menu saves goes into *folder*."""
+        path, clock = folder / "demo.toml", SystemClock()
+        listen = f"127.0.0.1:{self.menu_port}" if self.menu_port else ""
+        path.write_text(CONFIGURATION.format(serial=serial, tcp=tcp, port=self.port, menu=listen), encoding="utf-8")
+        gateway = Gateway(ConfigFile(path, folder, clock), clock, LogRing())
+        shared = shared_of(gateway)
+        gateway.terminal_plans = lambda config: terminal_plans(config, shared, None)
+        return gateway
+
+    def _run(self, gateway: Gateway, started: threading.Event) -> None:
+        gateway.run(started.set)
+        self.has_ended = True
 
     def look(self, scada: Scada, number: int) -> None:
         """Look at everything once; on the third look write a setpoint."""
@@ -272,7 +287,7 @@ def run_demo(seconds: float | None, port: int, silent: str | None, out: TextIO, 
     demo = Demo(port, silent)
     try:
         with demo.running() as scada:
-            print(_welcome(port), file=out, flush=True)
+            print(_welcome(port, demo.menu_port), file=out, flush=True)
             _watch(demo, scada, seconds, out, stop)
     except LinkUnavailable as error:
         print(f"rtugate demo: {error}; try --port", file=sys.stderr)
@@ -286,7 +301,7 @@ def run_demo(seconds: float | None, port: int, silent: str | None, out: TextIO, 
 def _watch(demo: Demo, scada: Scada, seconds: float | None, out: TextIO, stop: threading.Event) -> None:
     began_s = time.monotonic()
     number = 0
-    while not stop.wait(LOOK_EVERY_S):
+    while not stop.wait(LOOK_EVERY_S) and not demo.has_ended:
         number += 1
         passed_s = time.monotonic() - began_s
         demo.look(scada, number)
@@ -295,7 +310,8 @@ def _watch(demo: Demo, scada: Scada, seconds: float | None, out: TextIO, stop: t
             return
 
 
-def _welcome(port: int) -> str:
+def _welcome(port: int, menu_port: int | None) -> str:
+    menu = f"\n  telnet 127.0.0.1 {menu_port}    the menu; what it saves is gone with the demo\n" if menu_port else ""
     return f"""\
 rtugate demo: a meter and a boiler on a serial line, an I/O block on TCP; the gateway polls them
 and serves them as a slave (server) on 127.0.0.1:{port}, unit 1. Look at it yourself:
@@ -306,7 +322,7 @@ and serves them as a slave (server) on 127.0.0.1:{port}, unit 1. Look at it your
 
   python -c "from pymodbus.client import ModbusTcpClient as C; c = C('127.0.0.1', port={port}); c.connect(); \\
 print(c.read_input_registers(0, count=5).registers)"
-"""
+{menu}"""
 
 
 def _show(demo: Demo, passed_s: float, number: int, out: TextIO) -> None:

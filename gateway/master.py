@@ -67,6 +67,7 @@ class Master:
         self.ready = threading.Event()
         self.counters = PollCounters()
         self.busy_s = 0.0  # of the line's time, silences and listening included
+        self._since_s = clock.monotonic()
         self.polls, self.devices = polls_of(config)
         self.traffic = Tap(config.framing_used, clock, config.character_timeout_used)
         self._register = register
@@ -95,6 +96,12 @@ class Master:
     def trouble(self) -> str:
         """Why the line cannot be used, for people; "" while it can."""
         return self._opening.trouble
+
+    @property
+    def busy_share(self) -> float:
+        """Share of the line's time in use since it is polled, 0 to 1."""
+        passed_s = self._clock.monotonic() - self._since_s
+        return min(1.0, self.busy_s / passed_s) if passed_s > 0 else 0.0
 
     @property
     def has_alarm(self) -> bool:

@@ -8,6 +8,7 @@ Source: specification of rtugate, section 6. Any thread; nothing is shared.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from pathlib import Path
 from typing import Final
@@ -28,13 +29,10 @@ def sealed(content: bytes) -> bytes:
     return HEADER + hashlib.sha256(content).hexdigest().encode() + b"\n" + content
 
 
-def unsealed(content: bytes) -> str | None:
-    """Return the text that was sealed, or None if it is not whole."""
+def unsealed(content: bytes) -> bytes | None:
+    """Return what was sealed, or None if it is not whole."""
     rest = content.partition(b"\n")[2]
-    try:
-        return rest.decode() if content == sealed(rest) else None
-    except UnicodeDecodeError:  # nothing that was ever written here
-        return None
+    return rest if content == sealed(rest) else None
 
 
 class Snapshot:
@@ -55,14 +53,14 @@ class Snapshot:
         """Return what was written last; None where there is nothing. Raises SaveError if it is damaged."""
         try:
             content = self.path.read_bytes()  # with its seal it may be larger than a configuration file may be
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
             raise SaveError(f"{self.path.name} cannot be read: {files.in_words(error, self.path)}") from error
-        whole = unsealed(content)
-        if whole is None:
-            raise SaveError(f"{self.path.name} is damaged: its checksum does not fit; it is not used")
-        return whole.decode()
+        with contextlib.suppress(UnicodeDecodeError):  # nothing that was ever written here
+            if (whole := unsealed(content)) is not None:
+                return whole.decode()
+        raise SaveError(f"{self.path.name} is damaged: its checksum does not fit; it is not used")
 
     def remove(self) -> None:
         """There is nothing to keep any more; raises SaveError."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import math
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -302,7 +303,7 @@ class Session:
         if reason == self._told and now_s < self._told_s + WAITING_TOLD_S:
             return
         self._told, self._told_s = reason, now_s
-        self._say(self._why_waiting(standing) + "\n")
+        self._say(textwrap.fill(self._why_waiting(standing), self.columns - 1) + "\n")
 
     def _why_waiting(self, standing: Standing) -> str:
         _ = self._translate

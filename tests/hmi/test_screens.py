@@ -176,8 +176,21 @@ def test_a_master_that_is_made_anew_cannot_be_used_for_a_moment(boiler: Desk) ->
     boiler.station.masters.pop("field").close()
     boiler.type("c")
     assert boiler.told == "field is being started anew: try again in a moment."
+
+
+def test_the_traffic_of_a_line_that_is_made_anew_is_followed_on(boiler: Desk) -> None:
     boiler.type("t1")
-    assert boiler.told == "field is in maintenance: A or S switches it on."
+    boiler.wait(1.0)
+    old = boiler.station.masters["field"]
+    assert old.traffic.is_watched
+    boiler.station.masters.pop("field").close()
+    boiler.wait(0.5)
+    assert not old.traffic.is_watched
+    boiler.station.masters["field"] = boiler.station._a_master(boiler.station.config.master[0])
+    assert "> unit 17: read 3 holding registers" in boiler.wait(2.0)
+    boiler.type(" ")
+    assert not boiler.station.masters["field"].traffic.is_watched
+    assert boiler.screen.endswith("rtugate> ")
 
 
 # ------------------------------------------------------------------------------------------------ E, T, L, notices

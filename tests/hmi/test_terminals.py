@@ -32,10 +32,9 @@ from gateway.hmi.terminals import (
     TelnetSession,
     Terminals,
     Welcome,
-    is_allowed,
 )
 from gateway.link import Waker
-from gateway.link_tcp import listen_tcp
+from gateway.link_tcp import is_allowed, listen_tcp
 from tests.fakes import JumpingClock
 from tests.hmi.terminals import CHEAP_HASH, CLOCK, MAIN_MENU, PASSWORD, Client, House, tcp_client
 from tests.lines import PATIENCE_S, Pty, Running, pty_pair, running

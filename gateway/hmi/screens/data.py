@@ -103,7 +103,8 @@ def _page(table: Table, first: int, samples: list[Sample], ui: Ui) -> tuple[list
 
 
 def _title(table: Table, first: int, count: int, _: Translate) -> str:
-    title = f"{table_name(table, _).capitalize()}: {point_name(table, first, _)}"
+    name = point_name(table, first, _)
+    title = name[0].upper() + name[1:]
     return title if count == 1 else _("{first} and {count} more").format(first=title, count=count - 1)
 
 
