@@ -7,11 +7,13 @@ and counted: what SCADA has been shown already stays where it is.
 An entry is 7 registers: sequence number (1 to 65535, then 1 again), table (1 to 4, by the code of its read function),
 point, value, and the time in milliseconds since 1970 in three registers, highest first.
 
-Threads: changes come in the threads that write the register; SCADA's side runs in the slaves'. One lock, a leaf.
+Threads: changes come in the threads that write the register; SCADA's side runs in the slaves'; ``change`` in the main
+thread, while the others go on. One lock, a leaf.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -21,6 +23,7 @@ from typing import Final
 
 from gateway.clock import Clock
 from gateway.config import EVENT_BLOCK_ENTRIES, EVENT_ENTRY
+from gateway.errors import PointsOutOfRange
 from gateway.modbus.pdu import Span, Table, bit_at, pack_words, word_at
 from gateway.register import DataRegister, Source, SourceKind, Written
 
@@ -61,10 +64,7 @@ class EventQueue:
         """*size*: changes kept; *fifo_address*: what function 24 asks for; *block*: 3 + 7 n registers."""
         self._register = register
         self._clock = clock
-        self._spans = list(spans)
-        self._size = size
-        self._fifo_address = fifo_address
-        self._block = block
+        self._set(spans, size, fifo_address, block)
         self._source = Source(SourceKind.REQUEST, "events")
         self._lock = threading.Lock()
         self._known: dict[tuple[Table, int], int] = {}
@@ -74,6 +74,20 @@ class EventQueue:
         self._acknowledged = 0
         register.watch(self._written)
         self._show()
+
+    def change(self, spans: Sequence[Span], size: int, fifo_address: int | None, block: Span | None) -> None:
+        """Go on by other settings; what waits stays, and a point watched anew has no known value."""
+        with self._lock:
+            self._set(spans, size, fifo_address, block)
+            watched = {(span.table, point) for span in spans for point in range(span.start, span.stop)}
+            self._known = {place: self._known[place] for place in self._known.keys() & watched}
+        self._show()
+
+    def _set(self, spans: Sequence[Span], size: int, fifo_address: int | None, block: Span | None) -> None:
+        self._spans = list(spans)
+        self._size = size
+        self._fifo_address = fifo_address
+        self._block = block
 
     @property
     def waiting(self) -> int:
@@ -110,11 +124,12 @@ class EventQueue:
     # -------------------------------------------------------------------------------------------- the register's side
 
     def _written(self, written: Written) -> None:
-        if self._block is not None and written.source != self._source and written.span.overlaps(self._block):
-            self._block_written(self._block, written)
-        for span in self._spans:
-            if span.overlaps(written.span):
-                self._compare(written, max(span.start, written.span.start), min(span.stop, written.span.stop))
+        block = self._block  # looked at once: another thread may change it
+        with contextlib.suppress(PointsOutOfRange):  # the block's end was cut off just now: ``change`` shows it anew
+            if block is not None and written.source != self._source and written.span.overlaps(block):
+                self._block_written(block, written)
+            if self._spans and self._compare(written):
+                self._show()
 
     def _block_written(self, block: Span, written: Written) -> None:
         """Someone wrote into the block: its first register acknowledges, the others are ours and are set right."""
@@ -123,20 +138,24 @@ class EventQueue:
         else:
             self._show()
 
-    def _compare(self, written: Written, start: int, stop: int) -> None:
-        table, value_at = written.span.table, bit_at if written.span.table.is_bits else word_at
+    def _compare(self, written: Written) -> bool:
+        """Queue what has changed; return whether anything has."""
         when_ms = int(self._clock.wall() * 1000)
         with self._lock:
             before = len(self._changes), self._lost
-            for point in range(start, stop):
-                value = int(value_at(written.data, point - written.span.start))
-                old = self._known.get((table, point))
-                self._known[table, point] = value
-                if old is not None and old != value:
-                    self._add(table, point, value, when_ms)
-            is_news = (len(self._changes), self._lost) != before
-        if is_news:
-            self._show()
+            for span in self._spans:
+                if span.overlaps(written.span):
+                    self._compare_points(written, span, when_ms)
+            return (len(self._changes), self._lost) != before
+
+    def _compare_points(self, written: Written, span: Span, when_ms: int) -> None:
+        table, value_at = span.table, bit_at if span.table.is_bits else word_at
+        for point in range(max(span.start, written.span.start), min(span.stop, written.span.stop)):
+            value = int(value_at(written.data, point - written.span.start))
+            old = self._known.get((table, point))
+            self._known[table, point] = value
+            if old is not None and old != value:
+                self._add(table, point, value, when_ms)
 
     def _add(self, table: Table, point: int, value: int, when_ms: int) -> None:
         self._sequence = self._sequence % SEQUENCE_MAX + 1
@@ -148,8 +167,8 @@ class EventQueue:
     def _show(self) -> None:
         """Write the block anew; again if it has changed meanwhile, so that the newest is written last."""
         shown = None
-        while self._block is not None and shown != (now := self._block_registers(self._block.count)):
-            self._register.write(self._block, pack_words(now), self._source)
+        while (block := self._block) is not None and shown != (now := (block, self._block_registers(block.count))):
+            self._register.write(block, pack_words(now[1]), self._source)
             shown = now
 
     def _block_registers(self, count: int) -> list[int]:

@@ -59,21 +59,24 @@ class Master:
         waker: Waker,
         open_link: Callable[[], Link],
         wait_limit_s: float = 3.0,
+        late_s: dict[str, float] | None = None,
     ) -> None:
-        """*open_link* opens the line, or raises LinkError; it may take a while but must heed *waker*."""
+        """*open_link* opens the line, or raises LinkError; it may take a while but must heed *waker*.
+
+        late_s: until when a late reply may come on a port (monotonic), shared by all that use it."""
         self.name = config.name
         self.config = config
         self.enabled = config.enabled
         self.ready = threading.Event()
         self.counters = PollCounters()
-        self.busy_s = 0.0  # of the line's time, silences and listening included
-        self._since_s = clock.monotonic()
+        self.busy_s, self._since_s = 0.0, clock.monotonic()  # of the line's time, silences and listening included
         self.polls, self.devices = polls_of(config)
         self.traffic = Tap(config.framing_used, clock, config.character_timeout_used)
         self._register = register
         self._clock = clock
         self._waker = waker
         self._open_link = open_link
+        self._late_s = {} if late_s is None else late_s
         self._wait_limit_s = wait_limit_s
         self._opened: _Opened | None = None
         self._opening = Backoff(config.name, clock)
@@ -86,8 +89,8 @@ class Master:
         self._commands_in_row = 0
         self._tickets = TicketQueue(clock, waker.wake, has_broadcast=config.framing_used != "tcp")
         self._status = StatusPoints(self.polls, register)
-        self._stopping: Callable[[], bool] = lambda: False
-        self._alive: Callable[[], None] = lambda: None
+        self._stopping: Callable[[], bool] = bool  # until ``run``: False
+        self._alive: Callable[[], object] = bool
         self._queue = CommandQueue(register, clock, waker.wake)
         self._by_outlet = {poll.outlet: poll for poll in self.polls if poll.outlet}
         self._undo = take_points(self.polls, register, self._queue)
@@ -100,8 +103,7 @@ class Master:
     @property
     def busy_share(self) -> float:
         """Share of the line's time in use since it is polled, 0 to 1."""
-        passed_s = self._clock.monotonic() - self._since_s
-        return min(1.0, self.busy_s / passed_s) if passed_s > 0 else 0.0
+        return min(1.0, self.busy_s / max(self._clock.monotonic() - self._since_s, 1e-9))
 
     @property
     def has_alarm(self) -> bool:
@@ -149,6 +151,8 @@ class Master:
     def close(self) -> None:
         """Let go of the line, the register's points and the commands."""
         self._let_go()
+        if len(self._queue):
+            log.warning("%s: %d writes are not delivered: the line stops or is made anew", self.name, len(self._queue))
         for undo in self._undo:
             undo()
         self._undo.clear()
@@ -229,7 +233,8 @@ class Master:
             self.ready.set()
         log.debug("%s: polling on %s", self.name, self.config.line)
         timing = timing_of(self.config, link.character_s)
-        line = Line(link, self.config.framing_used, timing, self._clock, self.traffic.tell)
+        late_until_s = self._late_s.get(self.config.line, 0.0)
+        line = Line(link, self.config.framing_used, timing, self._clock, self.traffic.tell, late_until_s)
         self._opened = _Opened(link, line)
         again = self._schedule.due(self._clock.monotonic()) if self._is_resting else self._scheduled
         self._schedule.at_once(again)  # what was missed meanwhile is no overrun
@@ -265,6 +270,8 @@ class Master:
         if self._opened is not None:
             self._opened.link.close()
             self.traffic.ended()
+            if not self.config.is_tcp:  # a new connection brings no late reply of the old one
+                self._late_s[self.config.line] = self._opened.line.late_until_s
         self._opened = None
 
     # -------------------------------------------------------------------------------------------- what is next

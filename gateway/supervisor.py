@@ -1,14 +1,17 @@
 """The supervisor: starts every task in a thread of its own, starts again what ended with an error, stops them all.
 
-It knows tasks only as ``Task``. What a task is made of, and from what configuration, is ``wiring``'s affair.
+It knows tasks only as ``Task``. What a task is made of, and from what configuration, is ``wiring``'s affair: a new
+configuration comes as new plans, and only the tasks whose plan differs are stopped and made anew.
 
-Threads: ``run`` belongs to the main thread; ``stop`` may be called from a signal handler or any thread.
+Threads: ``run`` belongs to the main thread, and so does ``change``; ``stop`` and ``submit`` may be called from a signal
+handler or any thread.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -38,13 +41,23 @@ class Task(Protocol):
         """End any wait, so that *stop* is seen."""
         ...
 
+    def set_enabled(self, enabled: bool) -> None:
+        """False: maintenance; True: at work again. The task itself stays."""
+        ...
+
 
 @dataclass(frozen=True)
 class Plan:
-    """How a task is made; it is made anew after each error. Its waker belongs to the supervisor."""
+    """How a task is made; it is made anew after each error. Its waker belongs to the supervisor.
+
+    basis:   all that the task depends on but *enabled*; a plan with an equal basis needs no new task.
+    enabled: False: it starts in maintenance.
+    """
 
     name: str
     make: Callable[[Waker], Task]
+    basis: object = None
+    enabled: bool = True
 
 
 class Supervisor:
@@ -54,17 +67,43 @@ class Supervisor:
         self._clock = clock
         self._waker = Waker()
         self._stop = threading.Event()
-        self._runners = [_Runner(plan, clock, self._stop, self._waker.wake) for plan in plans]
+        self.chores: list[Callable[[], float]] = []  # of the main thread; each says after how long to come again
+        self.failed_s: float | None = None  # when a task ended with an error last, monotonic
+        self._jobs: deque[Callable[[], None]] = deque()
+        self._runners = [_Runner(plan, clock, self._failed) for plan in plans]
+        self._leaving: list[_Runner] = []  # told to stop, and not ended yet
 
     @property
     def tasks(self) -> dict[str, Task]:
         """The tasks that run, by name."""
-        return {runner.plan.name: runner.task for runner in self._runners if runner.task is not None}
+        return {runner.plan.name: task for runner in self._runners if (task := runner.task) is not None}
 
     def stop(self) -> None:
         """Have ``run`` end; from any thread, and from a signal handler."""
         self._stop.set()
         self._waker.wake()
+
+    def submit(self, job: Callable[[], None]) -> None:
+        """Have *job* done by the main thread; from any thread. After ``stop`` it is forgotten."""
+        self._jobs.append(job)
+        self._waker.wake()
+
+    def change(self, plans: Sequence[Plan], between: Callable[[], None] = lambda: None) -> None:
+        """Have the tasks of *plans* and no others: those with an equal basis stay; in the main thread only.
+
+        between: called when the old tasks have stopped and before the new ones start.
+        """
+        wanted = {plan.name: plan for plan in plans}
+        gone = [runner for runner in self._runners if not runner.suits(wanted.get(runner.plan.name))]
+        kept = {runner.plan.name: runner for runner in self._runners if runner not in gone}
+        self._leaving = [runner for runner in self._leaving if not runner.end(0.0)] + self._end(gone)
+        between()
+        self._runners = [kept.get(plan.name) or _Runner(plan, self._clock, self._failed) for plan in plans]
+        for plan, runner in zip(plans, self._runners, strict=True):
+            if plan.name in kept:
+                runner.take(plan)
+            else:
+                runner.start()
 
     def run(self, started: Callable[[], None] = lambda: None) -> bool:
         """Run all tasks until ``stop``. Returns False if one of them did not end in time.
@@ -76,32 +115,46 @@ class Supervisor:
                 runner.start()
             started()
             while not self._stop.is_set():
-                waits_s = [LOOK_EVERY_S] + [runner.look_after() for runner in self._runners]
+                while self._jobs and not self._stop.is_set():
+                    self._jobs.popleft()()
+                waits_s = (
+                    [LOOK_EVERY_S] + [runner.look_after() for runner in self._runners] + [do() for do in self.chores]
+                )
                 self._waker.wait(min(waits_s))
         finally:
             clean = self._stop_all()
         return clean
 
+    def _failed(self) -> None:
+        """A task has ended with an error, in its own thread."""
+        self.failed_s = self._clock.monotonic()
+        self._waker.wake()
+
     def _stop_all(self) -> bool:
         self._stop.set()
-        deadline_s = self._clock.monotonic() + STOP_LIMIT_S
-        for runner in self._runners:
-            runner.wake()
-        late = [r.plan.name for r in self._runners if not r.end(max(0.0, deadline_s - self._clock.monotonic()))]
-        for name in late:
-            log.error("%s: does not stop", name)
+        self._leaving = self._end([*self._leaving, *self._runners])
         self._waker.close()
-        return not late
+        return not self._leaving
+
+    def _end(self, runners: Sequence[_Runner]) -> list[_Runner]:
+        """Stop *runners*, all at once; return those that do not end in time: they are told of, and left alone."""
+        deadline_s = self._clock.monotonic() + STOP_LIMIT_S
+        for runner in runners:
+            runner.stop()
+        late = [runner for runner in runners if not runner.end(max(0.0, deadline_s - self._clock.monotonic()))]
+        for runner in late:
+            log.error("%s: does not stop", runner.plan.name)
+        return late
 
 
 class _Runner:
     """One task and its thread, over all its restarts."""
 
-    def __init__(self, plan: Plan, clock: Clock, stop: threading.Event, told: Callable[[], None]) -> None:
+    def __init__(self, plan: Plan, clock: Clock, told: Callable[[], None]) -> None:
         self.plan = plan
         self.task: Task | None = None
         self._clock = clock
-        self._stop = stop
+        self._stop = threading.Event()
         self._told = told
         self._waker = Waker()
         self._thread: threading.Thread | None = None
@@ -128,7 +181,19 @@ class _Runner:
             self.start()
         return max(0.0, left_s)
 
-    def wake(self) -> None:
+    def suits(self, plan: Plan | None) -> bool:
+        """Whether the task of *plan* is this one, switched on or off."""
+        return plan is not None and plan.basis == self.plan.basis
+
+    def take(self, plan: Plan) -> None:
+        """Go on by *plan*, which differs in ``enabled`` at most."""
+        before, self.plan = self.plan, plan
+        task = self.task  # looked at once: its thread takes it away when it ends with an error
+        if task is not None and plan.enabled != before.enabled:
+            task.set_enabled(plan.enabled)
+
+    def stop(self) -> None:
+        self._stop.set()
         self._waker.end()
 
     def end(self, limit_s: float) -> bool:
@@ -152,6 +217,9 @@ class _Runner:
             self._failed()
 
     def _failed(self) -> None:
+        if self._stop.is_set():
+            log.exception("%s: ended with an error while it was to stop", self.plan.name)
+            return
         log.exception("%s: ended with an error; starting it again in %.0f s", self.plan.name, self._restart_after_s)
         self._restart_s = self._clock.monotonic() + self._restart_after_s
         self._restart_after_s = min(RESTART_MOST_S, 2 * self._restart_after_s)

@@ -157,8 +157,12 @@ class Line:
         timing: Timing | None = None,
         clock: Clock | None = None,
         traffic: Callable[[bool, bytes], None] | None = None,
+        late_until_s: float = 0.0,
     ) -> None:
-        """*traffic*: told of all bytes: True and what was sent, False and what came; it must only queue."""
+        """Begin as a line that nothing is expected on, or, until *late_until_s* (monotonic), as a spoiled one.
+
+        traffic: told of all bytes: True and what was sent, False and what came; it must only queue.
+        """
         self._link = link
         self._timing = timing or Timing()
         self._clock = clock or SystemClock()
@@ -166,7 +170,7 @@ class Line:
         self._framer = reply_framer(framing)
         self._has_transactions = framing == "tcp"
         self._transaction = 0
-        self.state = State.IDLE
+        self.state = State.SPOILED if late_until_s > self._clock.monotonic() else State.IDLE
         self._asked: _Asked | None = None
         self._reply: Response | None = None
         self._done: Response | None = None
@@ -174,7 +178,7 @@ class Line:
         self._held_back_s = 0.0  # since when a request waits for silence
         self._sent_s = 0.0  # when the last bit of the request has left
         self._heard_s = 0.0  # when the last byte came
-        self._until_s = 0.0  # how long TURNAROUND or SPOILED last
+        self._until_s = late_until_s  # how long TURNAROUND or SPOILED last
 
     # -------------------------------------------------------------------------------------------- for programs
 
@@ -236,6 +240,13 @@ class Line:
     def is_free(self) -> bool:
         """True when nothing is pending and no late reply is listened for."""
         return self._asked is None and self.state is State.IDLE
+
+    @property
+    def late_until_s(self) -> float:
+        """Return until when a late reply may come on these wires (monotonic seconds), for the next Line; 0: none."""
+        if self.state in (State.AWAITING, State.CONFIRMING) and self._asked is not None:
+            return max(self._clock.monotonic(), self._deadline_s()) + self._asked.timeout_s
+        return self._until_s if self.state in (State.SPOILED, State.TURNAROUND) else 0.0
 
     def silent_in_s(self) -> float:
         """Return how long the line has to stay silent until a request would be sent at once; 0: it is by now."""

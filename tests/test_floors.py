@@ -20,16 +20,25 @@ FLOORS = [  # from the ground up; within a floor, in the order they may build on
         "backoff",
         "modbus.pdu",
         "modbus.framing",
+        "modbus.describe",
+        "modbus.pieces",
         "modbus.diagnostics",
         "modbus.identification",
+        "logs",
     ],
-    ["register", "toml_text", "config_fields", "config", "line_load", "config_checks"],
-    ["commands", "events", "modbus.server", "transaction", "link", "link_tcp", "polls", "serving", "store"],
-    ["master", "slave", "slave_tcp", "supervisor", "simulator"],
-    ["wiring"],
+    ["register", "toml_text", "toml_layout", "toml_pairs", "toml_edit", "config_fields", "config", "line_load"]
+    + ["config_checks", "hmi.wording", "hmi.telnet", "hmi.keys", "hmi.access", "hmi.seat", "hmi.menu"],
+    ["commands", "events", "modbus.server", "transaction", "link", "link_tcp", "polls", "tickets", "traffic"]
+    + ["serving", "files", "store", "difference", "save", "history", "snapshots", "retained", "documents"]
+    + ["hmi.background", "hmi.login", "hmi.session", "hmi.texts", "hmi.station"]
+    + [f"hmi.screens.{name}" for name in ("changes", "data", "command", "writes", "settings", "requests")]
+    + [f"hmi.screens.{name}" for name in ("lines", "status", "file", "main")]
+    + ["hmi.client", "config_file", "restart_cause"],
+    ["master", "slave", "slave_tcp", "hmi.console", "hmi.terminals", "hmi.control", "supervisor", "simulator"],
+    ["wiring", "running", "service", "edits"],
     ["demo", "cli"],
 ]
-TASKS = {"master", "slave", "slave_tcp"}
+TASKS = {"master", "slave", "slave_tcp", "hmi.console", "hmi.terminals"}
 PURE = {name for floor in FLOORS[:2] for name in floor} - {"clock"}
 OUTSIDE = {"os", "socket", "serial", "time", "select", "selectors", "subprocess"}
 PYMODBUS_USERS = {"simulator", "demo"}
