@@ -91,6 +91,9 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(command=_run)
     menu = commands.add_parser("menu", parents=[common], help="the menu of the gateway that runs, in this terminal")
     menu.set_defaults(command=_menu)
+    status = commands.add_parser("status", parents=[common], help="what the gateway that runs says of itself")
+    status.add_argument("--json", action="store_true", help="as one JSON object, for programs")
+    status.set_defaults(command=_status)
     passwd = commands.add_parser("passwd", parents=[common], help="set the password that telnet asks for")
     passwd.set_defaults(command=_passwd)
     history = commands.add_parser("history", parents=[common], help="the configurations that were saved last")
@@ -180,6 +183,18 @@ def _menu(parsed: argparse.Namespace) -> int:
     from gateway.hmi.client import run_menu
 
     return run_menu(_control_path(parsed), sys.stdin.fileno(), sys.stdout.fileno())
+
+
+def _status(parsed: argparse.Namespace) -> int:
+    from gateway.edits import ask_gateway
+
+    def ask() -> list[str]:
+        answer = ask_gateway(_control_path(parsed), "status --json" if parsed.json else "status")
+        if answer is None:
+            raise GatewayError(f"rtugate: no gateway runs here (no socket at {_control_path(parsed)})")
+        return [answer]
+
+    return _tell(ask)
 
 
 # ------------------------------------------------------------------------------------------------ the file

@@ -186,13 +186,14 @@ def _user_name(user_id: int) -> str:
 def remove_durably(path: Path) -> None:
     """Remove the file at *path*, if there is one, so that a power cut does not bring it back; raises SaveError."""
     try:
+        path.lstat()  # a read-only file system refuses to remove what is not there
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             path.unlink()
             os.fsync(folder)
         finally:
             os.close(folder)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return
     except OSError as error:
         raise SaveError(f"{escaped(path.name, NAME_CHARACTERS)} cannot be removed: {in_words(error, path)}") from error

@@ -62,6 +62,28 @@ def text_for(loaded_text: str, config: Config, file_name: str) -> Rendered:
         raise SaveError(f"{escaped(file_name)} is not saved: what is to be written would not load: {error}") from error
 
 
+def loaded_with(text: str, path: tuple[str, ...], value: object, file_name: str) -> store.Loaded:
+    """Return *text* with *value* at the key of *path*, and all that loading it says.
+
+    raises: ConfigError, if the new text cannot be used; what was wrong with the old one does not matter.
+    """
+    data = tomllib.loads(text) if _is_toml(text) else {}
+    table = data
+    for part in path[:-1]:
+        inner = table.setdefault(part, {})
+        table = inner if isinstance(inner, dict) else {}
+    table[path[-1]] = value
+    return store.load_text(edited(text, data, _title) if _is_toml(text) else text, file_name)
+
+
+def _is_toml(text: str) -> bool:
+    try:
+        tomllib.loads(text)
+    except (ValueError, RecursionError):  # loading it says what is wrong
+        return False
+    return True
+
+
 def _verified(text: str, config: Config, file_name: str) -> str:
     """*text*, with addresses spelled so that they load, and found to say what *config* says."""
     text = _without_confusion(text)

@@ -33,7 +33,7 @@ FLOORS = [  # from the ground up; within a floor, in the order they may build on
     + ["hmi.background", "hmi.login", "hmi.session", "hmi.texts", "hmi.station"]
     + [f"hmi.screens.{name}" for name in ("changes", "data", "command", "writes", "settings", "requests")]
     + [f"hmi.screens.{name}" for name in ("lines", "status", "file", "main")]
-    + ["hmi.client", "config_file", "restart_cause"],
+    + ["status", "hmi.client", "config_file", "restart_cause"],
     ["master", "slave", "slave_tcp", "hmi.console", "hmi.terminals", "hmi.control", "supervisor", "simulator"],
     ["wiring", "running", "service", "edits"],
     ["demo", "cli"],

@@ -25,17 +25,20 @@ def show_status(ui: Ui, station: Station) -> Dialogue[None]:
     """Show the whole station, live, until a key."""
     _ = ui.translate
     ui.help = _("The whole station at a glance; it is refreshed by itself.")
-    yield from ui.pages(lambda: (_head(ui, station), _rows(ui, station)), _("Any key: back."), every_s=STATUS_EVERY_S)
+    body = lambda: (status_head(ui, station), status_rows(ui, station))  # noqa: E731 - as a def it says no more
+    yield from ui.pages(body, _("Any key: back."), every_s=STATUS_EVERY_S)
 
 
-def _head(ui: Ui, station: Station) -> list[str]:
+def status_head(ui: Ui, station: Station) -> list[str]:
+    """Return what is told first: since when it runs, and why it was started."""
     _ = ui.translate
     uptime = duration_text(ui.clock.monotonic() - station.started_s)
     text = _("Running for {uptime}; last restart: {cause}").format(uptime=uptime, cause=_(station.last_restart))
     return [text + (_("; unsaved changes") if station.is_unsaved else "")]
 
 
-def _rows(ui: Ui, station: Station) -> list[str]:
+def status_rows(ui: Ui, station: Station) -> list[str]:
+    """Return alarms, lines, requests and clients, a row each."""
     _ = ui.translate
     alarms = station.alarms()
     told = [_("ALARM: {alarm}").format(alarm=alarm.words(_)) for alarm in alarms] or [_("No alarms.")]
