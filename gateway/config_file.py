@@ -120,9 +120,14 @@ class ConfigFile:
         raises: SaveError, ConfigError, if that cannot be known.
         """
         marked = self._marker.text()
-        content = self._content()
-        if marked is None or content is None:
+        if marked is None:
             return None
+        try:
+            content = read(self.path)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise SaveError(f"{self.path.name} cannot be read: {files.in_words(error, self.path)}") from error
         digest, _, text = marked.partition("\n")
         if _digest(content) == digest:
             return load_text(text, self.path.name)  # it was good once
@@ -202,8 +207,10 @@ class ConfigFile:
         return text_for(self._text or "", config, self.path.name)
 
     def difference(self, config: Config) -> list[str]:
-        """Return what saving *config* would change, as lines for a person. Raises SaveError."""
-        return difference(self._text or "", self.rendered(config).text)
+        """Return what saving *config* would change in the file as it is now, for a person. Raises SaveError."""
+        content = self._content()
+        now = self._text or "" if content is None else content.decode(errors="replace")
+        return difference(now, self.rendered(config).text)
 
     def is_edited(self) -> bool:
         """Whether somebody has changed the file since it was read or written, or tried to be read."""
@@ -266,7 +273,7 @@ class ConfigFile:
         try:
             save(self.path, text, None if overwrite else self._text)
         except SaveError:
-            if is_marked:
+            if is_marked and self._content() not in (None, text.encode()):  # else a start may have to undo it
                 self._forget_marker()
             raise
 

@@ -46,16 +46,25 @@ def write_atomically(path: Path, content: bytes, mode_for_new: int = MODE_FOR_NE
     raises: SaveError, in words for a person; the file is then the old one, unless the words say otherwise.
     """
     name = escaped(path.name, NAME_CHARACTERS)
-    target = Path(os.path.realpath(path))
+    target = path
     try:
+        target = _real(path)
         folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             _replace(target, content, mode_for_new)
             _flush_folder(folder, name)
         finally:
-            os.close(folder)
+            _close(folder)
     except OSError as error:
         raise SaveError(f"{name} is not saved: {in_words(error, target)}") from error
+
+
+def _real(path: Path) -> Path:
+    """Return where links lead to; a link that cannot be looked at is no reason to replace the link itself."""
+    try:
+        return Path(os.path.realpath(path, strict=True))
+    except FileNotFoundError:  # a new file
+        return Path(os.path.realpath(path))
 
 
 def _replace(target: Path, content: bytes, mode_for_new: int) -> None:
@@ -66,8 +75,9 @@ def _replace(target: Path, content: bytes, mode_for_new: int) -> None:
     try:
         _lock(descriptor)
         _write(descriptor, content)
-        if old is not None:
-            _give_to_owner_of(old, descriptor)
+        _give_to_owner_of(
+            target.parent.stat() if old is None else old, descriptor
+        )  # also what root makes for the service
         os.fchmod(descriptor, mode_for_new if old is None else stat.S_IMODE(old.st_mode))
         os.fsync(descriptor)
         temporary.rename(target)
@@ -76,6 +86,11 @@ def _replace(target: Path, content: bytes, mode_for_new: int) -> None:
             temporary.unlink()
         raise
     finally:
+        _close(descriptor)
+
+
+def _close(descriptor: int) -> None:
+    with contextlib.suppress(OSError):  # what is on the disk, the flush before it has said
         os.close(descriptor)
 
 
@@ -192,7 +207,7 @@ def remove_durably(path: Path) -> None:
             path.unlink()
             os.fsync(folder)
         finally:
-            os.close(folder)
+            _close(folder)
     except (FileNotFoundError, NotADirectoryError):
         return
     except OSError as error:

@@ -79,7 +79,8 @@ def _run(gateway: Gateway, last_run: LastRun, listen: Callable[[], socket]) -> b
     log.info("last restart: %s", gateway.last_restart)
     with _signals_heeded(gateway):
         is_clean = gateway.run()
-    last_run.end(BY_MENU if gateway.wants_restart else CLEAN)
+    if is_clean:
+        last_run.end(BY_MENU if gateway.wants_restart else CLEAN)
     log.info("stopped")
     return is_clean
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 from gateway.clock import SystemClock
 from gateway.config import Config
+from gateway.config_file import ConfigFile
 from gateway.hmi.station import Job
 from gateway.logs import LogRing
 from gateway.running import Gateway
@@ -31,9 +32,9 @@ def done(job: Job) -> Job:
 class Bench:
     """A gateway that is not running, on a clock that jumps; ``look`` is what it does now and then while it runs."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: Place, kind: type[ConfigFile] = ConfigFile) -> None:
         self.place, self.clock = place, place.clock
-        self.gateway = Gateway(place.file(), place.clock, LogRing())
+        self.gateway = Gateway(kind(place.path, place.state, place.clock), place.clock, LogRing())
 
     @property
     def config(self) -> Config:

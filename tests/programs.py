@@ -101,9 +101,9 @@ class Program:
 
     @contextmanager
     def menu(self) -> Iterator[Client]:
-        """The menu, at its prompt."""
+        """The menu, in a terminal in which everything has room."""
         with unix_client(self.control) as client:
-            client.send(b"menu 80 24 maria\n")
+            client.send(b"menu 120 80 maria\n")
             yield client
 
     def stop(self, number: int = signal.SIGTERM) -> int:

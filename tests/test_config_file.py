@@ -341,3 +341,14 @@ def test_on_a_disk_that_is_read_only_the_gateway_starts_and_says_what_it_cannot_
         save(file, 4, confirm_s=600.0)
     assert save(file, 4) == ["this version is not kept in the history: the file system is read-only"]
     assert place.text == text_counting(4)
+
+
+def test_what_a_save_would_change_is_told_of_the_file_as_it_is_now(place: Place) -> None:
+    file = place.file()
+    config = file.start()
+    place.path.write_text(GOOD.replace("count = 3", "count = 5"))  # by hand, in the meantime
+    assert file.difference(config) == ['master "field", request 1', "- count = 5", "+ count = 3"]
+    place.path.write_bytes(b"\xff\xfe[[")
+    assert file.difference(config)
+    place.path.unlink()
+    assert file.difference(config) == []

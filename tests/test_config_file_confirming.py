@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway.config import factory
 from gateway.errors import ConfigError, SaveError
 from gateway.snapshots import UNCONFIRMED, Snapshot
 from tests.config_files import (
@@ -256,6 +257,16 @@ def test_a_mark_that_could_not_be_used_never_undoes_a_later_save(place: Place, m
     assert place.file().start() == config_of(text_counting(4))
 
 
+def test_a_mark_that_cannot_be_removed_is_told(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    save(place.started(), 4, confirm_s=600.0)
+    with disk_full(monkeypatch):
+        file = place.started()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", raising(errno.EROFS))
+        assert save(file, 5) == ["unconfirmed.toml cannot be removed: the file system is read-only"]
+    assert place.file().start() == config_of(text_counting(5))
+
+
 def test_a_previous_file_that_this_version_refuses_is_not_put_back(place: Place) -> None:
     file = place.started()
     save(file, 4, confirm_s=600.0)
@@ -272,6 +283,38 @@ def test_a_file_that_cannot_be_read_keeps_the_mark_for_a_start_that_can(place: P
     place.started()
     hidden.rename(place.path)
     assert place.file().start() == config_of(GOOD)
+
+
+def test_a_mark_beside_something_that_is_no_file_is_an_alarm(place: Place) -> None:
+    save(place.started(), 4, confirm_s=600.0)
+    place.path.unlink()
+    place.path.mkdir()
+    file = place.file()
+    assert file.start() == factory()
+    assert (
+        "a save that nobody confirmed, if there was one, cannot be undone: rtugate.toml cannot be read" in told(file)[1]
+    )
+    assert place.names() == [UNCONFIRMED]
+
+
+def test_a_save_that_was_written_but_may_be_lost_is_undone_by_the_next_start(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The new content is there, the flush of its folder has failed: nobody was told that it is saved."""
+    file, flush, folder = place.started(), os.fsync, place.path.parent.stat().st_ino
+
+    def failing(descriptor: int) -> None:
+        if os.fstat(descriptor).st_ino == folder:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        flush(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", failing)
+        with pytest.raises(SaveError, match="may lose it in a power cut"):
+            save(file, 4, confirm_s=600.0)
+    assert (place.text, place.names(), file.is_edited()) == (text_counting(4), [UNCONFIRMED], True)
+    assert place.file().start() == config_of(GOOD)
+    assert place.text == GOOD
 
 
 @pytest.mark.parametrize("size", [1024 * 1024, 1024 * 1024 - 100])

@@ -397,6 +397,22 @@ def test_a_rollback_where_no_file_can_be_says_why(place: Place, control: Path) -
         rollback(place.path.parent / "no" / "file.toml", place.state, control, 1)
 
 
+def test_a_file_that_changes_in_the_middle_of_a_rollback_is_not_written_over(
+    place: Place, control: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions(place, 4)
+    flush = os.fsync
+
+    def edited_meanwhile(descriptor: int) -> None:
+        place.path.write_text(EDITED)
+        flush(descriptor)
+
+    monkeypatch.setattr(os, "fsync", edited_meanwhile)
+    with pytest.raises(FileChanged):
+        rollback(place.path, place.state, control, 1)
+    assert place.text == EDITED
+
+
 def test_a_history_that_cannot_take_the_old_version_does_not_stop_a_rollback(
     place: Place, control: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

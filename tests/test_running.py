@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 from gateway.clock import SystemClock
-from gateway.config import LogConfig, factory
+from gateway.config import Config, LogConfig, factory
 from gateway.errors import ConfigError, GatewayError
 from gateway.logs import LogRing
 from gateway.retained import FILE_NAME, RetainedFile
 from gateway.running import NOTICES_KEPT, Gateway
 from gateway.snapshots import LAST_GOOD
+from gateway.supervisor import Plan
 from tests.changing import read, serial_master
 from tests.config_files import BAD, EDITED, GOOD, Place, config_of, counting, text_counting
 from tests.fakes import JumpingClock
@@ -141,10 +142,18 @@ def test_a_change_of_what_runs_no_longer_is_refused(bench: Bench) -> None:
     assert bench.config is after
 
 
+def noting(seen: list[Config], plans: list[Plan], config: Config) -> list[Plan]:
+    """Plans of the terminals, which note what configuration they were asked for."""
+    seen.append(config)
+    return plans
+
+
 def test_a_change_that_is_overtaken_is_done_and_only_the_newest_is_put_to_work(place: Place) -> None:
     with live(place) as run:
-        made = []
+        made: list[Config] = []
+        put_to_work: list[Config] = []
         with run.held():
+            run.gateway.terminal_plans = partial(noting, put_to_work, run.tasks.plans("menu"))
             jobs = []
             for count in (4, 5, 6):
                 new = counting(BASE, count)
@@ -152,6 +161,7 @@ def test_a_change_that_is_overtaken_is_done_and_only_the_newest_is_put_to_work(p
                 made.append(new)
             assert not any(job.is_done for job in jobs)
         assert [done(job).problem for job in jobs] == ["", "", ""]
+        assert put_to_work == made[-1:]
         assert run.station_config is made[-1]
         assert run.gateway.station.masters["field"].config == made[-1].master[0]
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from gateway.clock import SystemClock
+from gateway.config import Config
+from gateway.config_file import ConfigFile
 from gateway.errors import ConfigError
 from gateway.running import GOOD_AFTER_S
 from gateway.snapshots import LAST_GOOD, UNCONFIRMED
@@ -125,6 +127,31 @@ def test_an_unconfirmed_save_is_never_kept(bench: Bench) -> None:
     done(bench.gateway.confirm(nobody))
     bench.look()
     assert bench.last_good() == counting(BASE, 4)
+
+
+class LateSave(ConfigFile):
+    """Somebody saves just when it was found that no save waits for its confirmation."""
+
+    late: Config | None = None
+
+    @property
+    def confirm_left_s(self) -> float | None:
+        left_s = super().confirm_left_s
+        if self.late is not None:
+            late, self.late = self.late, None
+            self.save(late, confirm_s=600.0)
+        return left_s
+
+
+def test_a_save_in_the_very_moment_of_looking_is_not_kept_unconfirmed(place: Place) -> None:
+    bench = Bench(place, LateSave)
+    bench.change(4)
+    bench.run_s(61.0)
+    assert isinstance(bench.gateway.file, LateSave)
+    bench.gateway.file.late = bench.config
+    bench.look()
+    assert bench.gateway.confirm_left_s is not None
+    assert bench.last_good() is None
 
 
 def test_what_comes_back_unconfirmed_has_to_prove_good_itself(bench: Bench) -> None:

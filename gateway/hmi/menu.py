@@ -205,25 +205,31 @@ class Ui:
     # -------------------------------------------------------------------------------------------- showing
 
     @property
-    def _room(self) -> int:
+    def room(self) -> int:
         """Lines that stand above a prompt and what is said with it."""
         return max(1, self.rows - 6)
+
+    def help_lines(self) -> list[str]:
+        """Return what ? tells on this screen."""
+        _ = self.translate
+        keys = _("Enter keeps what stands in brackets, Esc goes back, more than 8 characters lead to the main menu.")
+        return [*filter(None, self.help.split("\n")), keys]
 
     def listed(self, lines: Sequence[str]) -> Dialogue[None]:
         """Show *lines*, a screenful at a time; Esc goes back."""
         _ = self.translate
         shown = [part for line in lines for part in self.parts(line)]
-        for start in range(0, len(shown), self._room):
+        for start in range(0, len(shown), self.room):
             if start:
                 answer = yield AskKey(_("Any key: more. Esc: back."), "", any_key=True)
                 self.show("\n")
                 if answer == ESC:
                     raise Back
-            self.say(*shown[start : start + self._room])
+            self.say(*shown[start : start + self.room])
 
     def _in_columns(self, lines: list[str]) -> list[str]:
         """Return *lines* side by side where there are too many of them for one screenful."""
-        if len(lines) <= self._room:
+        if len(lines) <= self.room:
             return lines
         half, width = (len(lines) + 1) // 2, (self.columns - 1) // 2
         left, right = lines[:half], [*lines[half:], ""]
@@ -232,11 +238,12 @@ class Ui:
     def pages(
         self, body: Callable[[], tuple[list[str], list[str]]], hint: str, keys: str = "", every_s: float = 1.0
     ) -> Dialogue[str]:
-        """Show a head and rows, live, until a key that does not turn the pages; return it.
+        """Show a head and rows, live, until a key that neither turns the pages nor asks for help; return it.
 
         body:  the head, which stands on every page, and the rows.
         Each picture is as tall as the terminal, so that it comes to stand where the last one stood, on any terminal.
         """
+        _ = self.translate
         page, shown = 0, None
         while True:
             head, rows = body()
@@ -250,6 +257,10 @@ class Ui:
             answer = yield AskKey("", keys, any_key=True, every_s=every_s, is_quiet=True)
             if answer in (" ", "+", "-") and last:
                 page = (page + (-1 if answer == "-" else 1)) % (last + 1)
+            elif answer == HELP:
+                self.say("", *self.help_lines())
+                yield AskKey(_("Any key: back."), "", any_key=True)
+                shown = None
             elif answer is not None:
                 self.show("\n")
                 return answer
@@ -408,6 +419,7 @@ class Menu:
         if outcome is Outcome.DONE:
             return echo + done(self._editor.text)
         if outcome is Outcome.ESCAPE:
+            self._skips = self.ends_keys_with_enter  # the Enter that sends an Esc is no answer to what comes next
             self._resume(None, Back())
             return "\n"
         if outcome is Outcome.OVERFLOW:
@@ -425,7 +437,7 @@ class Menu:
 
     def _key_done(self, ask: AskKey, key: str) -> str:
         answer = key.lower()
-        if ask.any_key:
+        if ask.any_key and (answer != HELP or ask.is_quiet):
             self._resume(answer)
             return ""
         if key == ESC:
@@ -442,15 +454,13 @@ class Menu:
         _ = self._ui.translate
         if key.isprintable():
             told = ask.wrong or _("{key} is no choice here; one of: {keys}. Esc goes back, ? helps.")
-            keys = " ".join(dict.fromkeys(ask.keys.upper()))
+            keys = " ".join(dict.fromkeys(ask.keys.upper().strip()))
             self._ui.say(told.format(key=_("Space") if key == " " else key, keys=keys))
         self._begin_line(ask)
         self._ui.prompt(ask.prompt)
 
     def _help(self) -> None:
-        _ = self._ui.translate
-        keys = _("Enter keeps what stands in brackets, Esc goes back, more than 8 characters lead to the main menu.")
-        self._ui.say(*filter(None, (*self._ui.help.split("\n"), keys)))
+        self._ui.say(*self._ui.help_lines())
         if isinstance(self._ask, AskKey | AskLine):
             self._begin_line(self._ask)
             self._ui.prompt(self._ask.prompt)

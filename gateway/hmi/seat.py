@@ -18,7 +18,7 @@ from typing import Final
 
 from gateway.clock import Clock
 
-SERIAL_LEAST_S: Final = 5.0  # so long a serial person keeps what he took, whatever serial_hold says
+SERIAL_LEAST_S: Final = 5.0  # so long a serial person keeps what he took where serial_hold is 0: he must get to type
 
 
 class Rank(IntEnum):
@@ -138,7 +138,7 @@ class Seat:
     def _quiet_at_s(self, hold_s: float) -> float:
         """When the serial console will have been silent for long enough."""
         is_serials = self._holder is not None and self._holder.rank is Rank.SERIAL
-        return self._serial_s + (max(hold_s, SERIAL_LEAST_S) if is_serials else hold_s)
+        return self._serial_s + ((hold_s or SERIAL_LEAST_S) if is_serials else hold_s)
 
     def _give(self, person: Person) -> None:
         self._holder = person

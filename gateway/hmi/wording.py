@@ -5,6 +5,7 @@ Pure. Source: specification of rtugate, section 5 and its preface on words.
 
 from __future__ import annotations
 
+import re
 import struct
 import unicodedata
 from collections.abc import Callable
@@ -110,6 +111,16 @@ def registers_of(data: bytes, order: str) -> tuple[int, int]:
     """Return the two registers that carry *data* (four bytes, most significant first) in *order*."""
     first, second = struct.unpack(">HH", bytes(data[place] for place in ORDERS[order]))  # each order is its own inverse
     return first, second
+
+
+def plain_reference_problem(table: Table, text: str, _: Translate) -> str | None:
+    """Return what to say of *text*, typed where an address is meant, if it can be nothing but a reference: "400108"
+    with its six digits, or a coil's "00108"."""
+    found = re.fullmatch(f"{REFERENCE_DIGITS[table]}([0-9]{{4,5}})", text)
+    number = int(found[1]) if found is not None else 0
+    if not 1 <= number <= 0x10000 or (len(text) == 5 and table is not Table.COILS):
+        return None
+    return _("{number} looks like a reference number: for it type {address}.").format(number=text, address=number - 1)
 
 
 def reference_problem(table: Table, number: int, _: Translate) -> str | None:

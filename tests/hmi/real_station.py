@@ -55,7 +55,7 @@ class RealStation:
         return self._log.read_text()
 
     def start(self) -> None:
-        """Start it; return once the menu can be reached."""
+        """Start it; return once telnet is let in."""
         arguments = ["run", "-c", str(self.file), "--state", str(self.state)]
         environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "RUNTIME_DIRECTORY": "", "TZ": "UTC"}
         with self._log.open("ab") as log:
@@ -63,10 +63,8 @@ class RealStation:
         self.has_started()
 
     def has_started(self) -> None:
-        """Wait until it has started once more, by ``start`` or by itself, and the menu can be reached."""
+        """Wait until it has started once more, by ``start`` or by itself, and telnet is let in."""
         self._starts += 1
-        if "[hmi.serial]" in self.file.read_text():
-            self.wait_for("serial console: open", self._starts)
         self.wait_for("telnet server: listening", self._starts)
 
     def wait_for(self, words: str, times: int = 1) -> None:

@@ -25,7 +25,7 @@ def test_a_new_request_holds_what_was_typed_and_no_more(boiler: Desk) -> None:
     boiler.type("rn18\r3\r200\r2\r\r20\r")
     keys = {"unit": 18, "function": 3, "address": 200, "count": 2, "point": 20}
     assert given(requests_of(boiler)[-1]) == keys
-    boiler.type("n18\r5\r7\r2\r9\r")
+    boiler.type("n18\r5\r7\r\r2\r9\r")
     assert given(requests_of(boiler)[-1]) == {
         "unit": 18,
         "function": 5,

@@ -115,8 +115,7 @@ A_PASSWORD: Steps = [
 ]
 A_SAVE: Steps = [
     (UNSAVED, "w"),
-    ("Any key: more. Esc: back.", " "),
-    ("Save this? (y/n/c): ", "y"),
+    ("Save this? (y/n/c)", "y"),
     ("Saved.", ""),
 ]
 A_RESTART: Steps = [(MAIN, "x"), ("Restart the gateway? (y/n): ", "y"), ("Restarting.", "")]

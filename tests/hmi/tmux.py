@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import subprocess
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,8 @@ from pathlib import Path
 from tests.hmi.real_station import eventually
 
 UPDATES = "UPDATE_SCREENS" in os.environ  # write the screens anew, and fail, so that somebody looks at them
+SETTLED_LOOKS = 80  # that are the same: then a screen that is to be kept stands still
+DIFFERENT_S = 10.0  # a screen that does not come to look as it should by then is another one
 SETTINGS = ["set", "-g", "remain-on-exit", "on", ";", "set", "-g", "status", "off", ";"]
 
 
@@ -67,18 +70,23 @@ def tmux(folder: Path) -> Iterator[Callable[..., Terminal]]:
 def matches(kept: Path, look: Callable[[], str]) -> None:
     """Look until what is seen is what the file *kept* says; the error shows how they differ."""
     if UPDATES:
-        kept.write_text(look() + "\n")
+        kept.write_text(_settled(look) + "\n")
         return
-    wanted = kept.read_text() if kept.exists() else ""
-    seen = ""
-
-    def look_again() -> str:
-        nonlocal seen
-        seen = look() + "\n"
-        return seen
-
+    wanted = kept.read_text().rstrip("\n") if kept.exists() else ""
     try:
-        eventually(look_again, lambda screen: screen == wanted, limit_s=5.0)
+        eventually(look, lambda seen: seen == wanted, limit_s=DIFFERENT_S)
     except AssertionError:
-        difference = difflib.unified_diff(wanted.splitlines(), seen.splitlines(), kept.name, "seen", lineterm="")
-        raise AssertionError("\n".join(difference)) from None
+        seen = look()
+        difference = difflib.unified_diff(wanted.split("\n"), seen.split("\n"), kept.name, "seen", lineterm="")
+        raise AssertionError("\n".join(difference) or f"{kept.name} was seen only after {DIFFERENT_S:g} s") from None
+
+
+def _settled(look: Callable[[], str]) -> str:
+    """Return what is seen once it has stayed the same for a while."""
+    seen: deque[str] = deque(maxlen=SETTLED_LOOKS)
+
+    def again() -> str:
+        seen.append(look())
+        return seen[-1]
+
+    return eventually(again, lambda _last: len(seen) == SETTLED_LOOKS and len(set(seen)) == 1)

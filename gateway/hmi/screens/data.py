@@ -14,6 +14,7 @@ from gateway.hmi.wording import (
     age_text,
     cut,
     ordered,
+    plain_reference_problem,
     point_name,
     reference,
     reference_problem,
@@ -45,7 +46,9 @@ def ask_point(ui: Ui, prompt: str, table: Table, last: int, default: int | None 
     def judge(text: str) -> int:
         number = whole_number(text)
         is_hexadecimal = text.lower().startswith("0x")
-        problem = None if number is None or is_hexadecimal else reference_problem(table, number, _)
+        problem = plain_reference_problem(table, text, _)
+        if number is not None and not is_hexadecimal:
+            problem = problem or reference_problem(table, number, _)
         if number is None or problem or not 0 <= number <= last:
             told = _("Please type a whole number from {low} to {high}.").format(low=0, high=last)
             raise ValueError(problem or told)
@@ -80,7 +83,7 @@ def show_data(ui: Ui, station: Station) -> Dialogue[None]:
         return _page(table, first, _samples(station.register, table, first, count), ui)
 
     while True:
-        is_wide = not table.is_bits and count > 1
+        is_wide = not table.is_bits and first + 1 < size
         hint = _("F: 32-bit values. Any other key: back.") if is_wide else _("Any key: back.")
         answer = yield from ui.pages(body, hint)
         if answer != "f" or not is_wide:
@@ -96,8 +99,8 @@ def _samples(register: DataRegister, table: Table, first: int, count: int) -> li
 
 def _page(table: Table, first: int, samples: list[Sample], ui: Ui) -> tuple[list[str], list[str]]:
     _ = ui.translate
-    where = f"{'':>6} {_('point'):>5}  "
-    values = f"{_('value'):>5}" if table.is_bits else f"{_('value'):>5} {_('signed'):>6}  {_('hex'):<4} {_('bits'):<16}"
+    where = f"{'':>6} {_('point'):>5} "
+    values = f"{_('value'):>5}" if table.is_bits else f"{_('value'):>5} {_('signed'):>6} {_('hex'):<4} {_('bits'):<16}"
     head = [_title(table, first, len(samples), _), where + values + f" {_('quality'):<7} {_('age'):>5} {_('source')}"]
     return head, [_row(table, first + n, sample, ui) for n, sample in enumerate(samples)]
 
@@ -109,9 +112,9 @@ def _title(table: Table, first: int, count: int, _: Translate) -> str:
 
 
 def _row(table: Table, point: int, sample: Sample, ui: Ui) -> str:
-    where = f"{reference(table, point):>6} {point:>5}  "
+    where = f"{reference(table, point):>6} {point:>5} "
     value = sample.value
-    shown = f"{value:>5}" if table.is_bits else f"{value:>5} {signed(value):>6}  {value:04X} {value:016b}"
+    shown = f"{value:>5}" if table.is_bits else f"{value:>5} {signed(value):>6} {value:04X} {value:016b}"
     state = f" {quality_name(sample.quality, ui.translate):<7} {age_text(sample.age_s):>5} {sample.source or ''}"
     return cut((where + shown + state).rstrip(), ui.columns - 1)
 

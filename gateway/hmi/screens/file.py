@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Final, TypeVar
 
 from gateway.config import factory
+from gateway.errors import SaveError
 from gateway.hmi.access import hash_password, password_problem
-from gateway.hmi.menu import Back, Dialogue, Ui
+from gateway.hmi.keys import ENTER
+from gateway.hmi.menu import AskKey, Back, Dialogue, Ui
 from gateway.hmi.screens.changes import changed, put_to_work
 from gateway.hmi.station import Job, Station
 from gateway.hmi.wording import duration_text
 
 PASSWORD_LIMIT: Final = 64
 LONGEST_WORK_S: Final = 120.0  # a save on a slow card, a hash on a slow board
+
+T = TypeVar("T")
 
 
 # ------------------------------------------------------------------------------------------------ W and U
@@ -26,7 +31,7 @@ def save(ui: Ui, station: Station) -> Dialogue[None]:
         yield from _confirm(ui, station, station.confirm_left_s)
         return
     overwrite = False
-    if station.is_file_changed():
+    if (yield from _found(ui, station, station.is_file_changed)):
         answer = yield from _ask_about_edited_file(ui)
         if answer == "r":
             yield from _wait(ui, station.reload(ui.wake), _("The file has been loaded anew."))
@@ -36,19 +41,43 @@ def save(ui: Ui, station: Station) -> Dialogue[None]:
     elif not station.is_unsaved:
         ui.say(_("There is nothing to save."))
         return
-    yield from ui.listed(station.difference())
     minutes = station.config.hmi.confirm_minutes
-    ui.say(
-        _("C saves, too, but what was saved before comes back unless confirmed within {minutes} min.").format(
-            minutes=minutes
-        )
-    )
-    answer = yield from ui.key(_("Save this? (y/n/c)"), f"ync{_('y')}")
+    told = _("C saves, too, but what was saved before comes back unless confirmed within {minutes} min.")
+    lines = [*(yield from _found(ui, station, station.difference)), told.format(minutes=minutes)]
+    answer = yield from _asked_below(ui, lines, _("Save this? (y/n/c)"), f"ync{_('y')}")
     if answer == "c":
         told = _("Saved. W confirms it within {minutes} min; else, or after a restart, the old file comes back.")
         yield from _wait(ui, station.save(overwrite, 60.0 * minutes, ui.wake), told.format(minutes=minutes))
     elif answer != "n":
         yield from _wait(ui, station.save(overwrite, None, ui.wake), _("Saved."))
+
+
+def _found(ui: Ui, station: Station, look: Callable[[], T]) -> Dialogue[T]:
+    """Return what *look* finds in the file: it is read and compared elsewhere, since that may take seconds.
+
+    raises: SaveError, whatever the reason.
+    """
+    found: list[T] = []
+    job = station.in_background(lambda: found.append(look()), ui.wake)
+    yield from ui.wait_for(lambda: job.is_done, LONGEST_WORK_S)
+    if not found:
+        _ = ui.translate
+        raise SaveError(_(job.problem) or _("This takes unusually long; see L."))
+    return found[0]
+
+
+def _asked_below(ui: Ui, lines: Sequence[str], question: str, keys: str) -> Dialogue[str]:
+    """Show *lines*, and ask below each screenful of them; who has seen enough need not see the rest."""
+    _ = ui.translate
+    left = [part for line in lines for part in ui.parts(line)]
+    while len(left) > ui.room:
+        ui.say(*left[: ui.room])
+        left = left[ui.room :]
+        answer = yield AskKey(f"{question}, {_('Space: more')}: ", f"{keys} ", takes_enter=True)
+        if answer not in (" ", ENTER):
+            return answer or ""
+    ui.say(*left)
+    return (yield from ui.key(question, keys))
 
 
 def _confirm(ui: Ui, station: Station, left_s: float) -> Dialogue[None]:

@@ -249,10 +249,8 @@ def _ask_all(
     table = NATURAL_TABLES[code]
     address = yield from ask_point(ui, _("Address"), table, 0xFFFF, known.get("address"))
     most = 1 if code in SINGLE_WRITES else min(QUANTITY_LIMITS[code], 0x10000 - address)
-    count = 1
-    if most > 1:
-        default = min(int(known.get("count", 1)), most) if known else None
-        count = yield from ui.number(_("Count"), 1, most, default)
+    default = min(int(known.get("count", 1)), most) if known or most == 1 else None
+    count = yield from ui.number(_("Count"), 1, most, default)
     every = yield from ui.seconds(_("Cycle time in seconds"), 0.01, 86400, known.get("every", 1.0))
     target = _target(known, code)
     size = config.register_.size(target)

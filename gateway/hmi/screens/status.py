@@ -6,7 +6,7 @@ from typing import Final
 
 from gateway.config import LineConfig, MasterConfig, SlaveConfig
 from gateway.counters import ServeCounters
-from gateway.hmi.menu import AskKey, Dialogue, Ui
+from gateway.hmi.menu import HELP, AskKey, Dialogue, Ui
 from gateway.hmi.screens.requests import error_name, state_name
 from gateway.hmi.screens.settings import ask_line_of, format_text
 from gateway.hmi.station import LineView, MasterView, SlaveView, Station
@@ -162,7 +162,10 @@ def _follow(ui: Ui, station: Station, name: str) -> Dialogue[bool]:
     dropped = view.traffic.dropped if view is not None else 0
     try:
         while _line_view(station, name) is view:
-            if (yield AskKey("", "", any_key=True, every_s=TRAFFIC_EVERY_S, is_quiet=True)) is not None:
+            key = yield AskKey("", "", any_key=True, every_s=TRAFFIC_EVERY_S, is_quiet=True)
+            if key == HELP:
+                ui.say(*ui.help_lines())
+            elif key is not None:
                 return True
             if view is not None:
                 dropped = _show_frames(ui, view, dropped)
