@@ -13,6 +13,7 @@ import logging
 import selectors
 import socket
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,11 +28,14 @@ from gateway.hmi.telnet import TelnetFilter
 from gateway.link import Waker
 from gateway.link_tcp import is_allowed, set_tcp_options
 
-RECEIVE_MAX: Final = 4096  # bytes taken from a terminal at once
+RECEIVE_MAX: Final = 1024  # bytes taken from a terminal at once
+READ_PAUSE_S: Final = 0.02  # so long no more is taken from it: faster than any person, and Modbus keeps the processor
+NEWCOMERS_MOST, NEWCOMERS_S = 10, 0.5  # so many in so short a time; then the next ones wait as long
 SEND_BUFFER: Final = 16384  # bytes that the system holds for a terminal: more would only make its screen late
 NO_DESCRIPTOR_PAUSE_S: Final = 0.5
 LINGER_S: Final = 2.0  # a connection that is over is kept so long, for the other side to read the last words
 CONNECTIONS_MOST: Final = 32  # of a task; sessions are far fewer
+WARN_AGAIN_S: Final = 60.0
 SESSIONS_MOST: Final = 8  # of telnet, and of `rtugate menu`
 
 log = logging.getLogger(__name__)
@@ -120,11 +124,12 @@ class Connection:
     socket: socket.socket
     conversation: Conversation
     has_ended_input: bool = False
+    reads_again_s: float = 0.0
     closes_at_s: float | None = None  # set when only its last words are left
 
-    def wanted(self) -> int:
+    def wanted(self, now_s: float) -> int:
         """What the selector has to tell of."""
-        reads = not self.has_ended_input or self.closes_at_s is not None
+        reads = now_s >= self.reads_again_s and (not self.has_ended_input or self.closes_at_s is not None)
         writes = bool(self.conversation.output)
         return selectors.EVENT_READ * reads | selectors.EVENT_WRITE * writes
 
@@ -153,7 +158,8 @@ class Terminals:
         self._wait_limit_s = wait_limit_s
         self._opening = Backoff(name, clock)
         self._listener: socket.socket | None = None
-        self._accepts_again_s: float | None = None  # set while no descriptor is left for a newcomer
+        self._accepts_again_s: float | None = None  # set while newcomers have to wait
+        self._newcomers_s: deque[float] = deque(maxlen=NEWCOMERS_MOST)  # when they came
         self._selector = selectors.DefaultSelector()
         self._selector.register(waker, selectors.EVENT_READ)
 
@@ -240,15 +246,22 @@ class Terminals:
             return
         except OSError as error:
             log.error("%s: a connection could not be accepted: %s", self.name, error.strerror)
-            self._selector.unregister(self._listener)
-            self._accepts_again_s = self._clock.monotonic() + NO_DESCRIPTOR_PAUSE_S
+            self._accept_again_after(NO_DESCRIPTOR_PAUSE_S)
             return
+        self._newcomers_s.append(self._clock.monotonic())
+        if self._newcomers_s[-1] - self._newcomers_s[0] < NEWCOMERS_S and len(self._newcomers_s) == NEWCOMERS_MOST:
+            self._accept_again_after(NEWCOMERS_S)
         conversation = self._welcomed(accepted) if len(self.connections) < CONNECTIONS_MOST else None
         if conversation is None:
             accepted.close()
             return
         self.connections[accepted.fileno()] = Connection(accepted, conversation)
         self._selector.register(accepted, selectors.EVENT_READ)
+
+    def _accept_again_after(self, pause_s: float) -> None:
+        assert self._listener is not None  # noqa: S101 - only a registered listener is selected
+        self._selector.unregister(self._listener)
+        self._accepts_again_s = self._clock.monotonic() + pause_s
 
     def _welcomed(self, accepted: socket.socket) -> Conversation | None:
         try:
@@ -270,6 +283,8 @@ class Terminals:
         for connection in self.connections.values():
             moment_s = connection.conversation.due_s() if connection.closes_at_s is None else connection.closes_at_s
             due_s += [] if moment_s is None else [moment_s]
+            if connection.reads_again_s > now_s:
+                due_s.append(connection.reads_again_s)
         return max(0.0, min(due_s) - now_s)
 
     def _receive(self, connection: Connection) -> None:
@@ -280,6 +295,7 @@ class Terminals:
         except OSError:
             self._close(connection)
             return
+        connection.reads_again_s = self._clock.monotonic() + READ_PAUSE_S
         if data:
             connection.conversation.receive(data)
         elif connection.closes_at_s is not None:
@@ -320,7 +336,7 @@ class Terminals:
         return count
 
     def _select(self, connection: Connection) -> None:
-        wanted, descriptor = connection.wanted(), connection.socket.fileno()
+        wanted, descriptor = connection.wanted(self._clock.monotonic()), connection.socket.fileno()
         known = self._selector.get_map().get(descriptor)
         if known is not None and known.events == wanted:
             return
@@ -374,24 +390,32 @@ class TelnetDoor:
 
     shared: Shared
     sessions: list[Session] = field(default_factory=list)
+    _warned_s: dict[str, float] = field(default_factory=dict)  # when each warning was logged last
 
     def __call__(self, accepted: socket.socket, wake: Callable[[], None]) -> Conversation | None:
         """Give a newcomer a session, or a reason, or nothing."""
         host = accepted.getpeername()[0]
         if not is_allowed(host, self.shared.hmi().telnet.allow):
-            log.warning("telnet: %s is not in the allowed networks", host)
+            self._warn("telnet: %s is not in the allowed networks", host)
             return None
         set_tcp_options(accepted)
         accepted.setsockopt(socket.SOL_SOCKET, socket.SO_OOBINLINE, 1)  # telnet's data mark stays in its place
         self.sessions = [session for session in self.sessions if not session.is_over]
         if len(self.sessions) >= SESSIONS_MOST:
-            log.warning("telnet: %s finds %d sessions and is closed", host, SESSIONS_MOST)
+            self._warn("telnet: %s finds all sessions taken and is closed", host)
             return LastWords(bytearray(too_many(self.shared).encode()))
-        log.info("telnet: %s has come", host)
+        log.debug("telnet: %s has come", host)
         session = TelnetSession(self.shared, host, wake)
         session.start()
         self.sessions.append(session)
         return session
+
+    def _warn(self, text: str, host: str) -> None:
+        """Log it, but each warning once a minute at most: a storm of connections fills no flash card."""
+        now_s = self.shared.clock.monotonic()
+        if now_s - self._warned_s.get(text, -WARN_AGAIN_S) >= WARN_AGAIN_S:
+            self._warned_s[text] = now_s
+            log.warning(text, host)
 
 
 def too_many(shared: Shared) -> str:

@@ -114,13 +114,17 @@ Steps = Sequence[tuple[str, str]]  # what the screen says at last, and which key
 
 
 class Hands:
-    """Somebody who types into a descriptor what the steps say, and types nothing before he was asked for it."""
+    """Somebody who types into a descriptor what the steps say, and types nothing before he was asked for it.
+
+    ``seen``: all that has come so far.
+    """
 
     def __init__(self, descriptor: int, ends_keys_with_enter: bool = False) -> None:
         """*ends_keys_with_enter*: his terminal sends whole lines only, a CR LF behind each."""
         self._descriptor = descriptor
         self._ends_keys_with_enter = ends_keys_with_enter
         self._got = b""
+        self.seen = b""
 
     def carry_out(self, steps: Steps) -> None:
         for asked, keys in steps:
@@ -151,4 +155,6 @@ class Hands:
     def _next(self) -> bytes:
         ready = select.select([self._descriptor], [], [], SOON_S)[0]
         assert ready, f"silence after {self._got.decode(errors='replace')}"
-        return os.read(self._descriptor, 4096)
+        data = os.read(self._descriptor, 4096)
+        self.seen += data
+        return data

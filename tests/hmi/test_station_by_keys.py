@@ -182,6 +182,8 @@ def test_by_telnet_from_an_empty_station_to_one_that_polls_after_a_restart(
             hands.carry_out(A_SAVE)
             hands.carry_out(A_RESTART)
             assert "The menu is closed" in hands.sees_the_end()
+            assert b"Please type" not in hands.seen  # no key was taken for another one
+            assert b"A name has" not in hands.seen
         station.has_started()
         polls(device, scada)
         logs_in(telnet, answers, ends_keys_with_enter)

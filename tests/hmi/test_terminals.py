@@ -26,6 +26,7 @@ from gateway.hmi.background import Background
 from gateway.hmi.terminals import (
     CONNECTIONS_MOST,
     LINGER_S,
+    NEWCOMERS_MOST,
     SESSIONS_MOST,
     LastWords,
     TelnetDoor,
@@ -258,6 +259,23 @@ def test_a_storm_of_bytes_from_one_client_ends_and_the_others_are_served(served:
         other.read_until("[rtugate is here]")
 
 
+def test_a_flood_is_read_no_faster_than_leaves_the_processor_to_modbus(served: Served) -> None:
+    with served.at_the_menu() as client:
+        started_s = CLOCK.monotonic()
+        client.send(bytes(20 * 1024) + bytes([IAC, 246]))
+        client.read_until("[rtugate is here]")
+        assert CLOCK.monotonic() - started_s > 0.3
+
+
+def test_newcomers_are_let_in_no_faster_than_leaves_the_processor_to_modbus(served: Served) -> None:
+    started_s = CLOCK.monotonic()
+    for _ in range(NEWCOMERS_MOST + 1):
+        with served.client() as client:
+            client.socket.recv(1)
+            client.reset()
+    assert CLOCK.monotonic() - started_s > 0.4
+
+
 def test_an_option_storm_gets_bounded_answers(served: Served) -> None:
     with served.at_the_menu() as client:
         client.send(bytes([IAC, DO, 42, IAC, WILL, 43, IAC, 246]) * 5000 + b"d")
@@ -463,3 +481,11 @@ def test_the_program_telnet_in_line_mode_still_has_the_menu(served: Served) -> N
         person.sees(r"['\r']")
         assert served.house.menu.keys == ["d", "\r"]
         assert served.house.menu.ends_keys_with_enter
+
+
+def test_a_storm_of_refused_connections_is_logged_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:
+    with serving(telnet={"allow": ["10.0.0.0/8"]}) as served:
+        for _ in range(5):
+            with served.client() as client:
+                assert client.read_all() == ""
+    assert caplog.text.count("is not in the allowed networks") == 1
