@@ -18,7 +18,7 @@ from gateway.simulator import Device, Simulator
 from tests.peers import client_tcp, free_port, unit_kwargs
 
 MINUTES_S = float(os.environ.get("RTUGATE_SOAK_S", "300"))
-WARM_UP_S = 30.0
+WARM_UP_S = 80.0  # after a minute the last good configuration is written, once: what that takes stays
 DEVICES = 10  # on each line
 REQUESTS = 200
 COUNT = 8  # registers of each request
