@@ -39,6 +39,9 @@ ALL_ALONE = ["keys", "random", "deaf", "mute", "dribbles", "dribbles", "resets",
 PASSWORD = "open sesame"  # noqa: S105 - opens nothing but these tests
 REQUEST = bytes.fromhex("0001 0000 0006 01 03 0000 000A")  # 10 holding registers of unit 1
 STATION = """\
+[log]
+level = "debug"                 # "has come" tells that a storm has begun
+
 [hmi]
 password = "{password}"
 
