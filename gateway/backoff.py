@@ -1,17 +1,22 @@
 """Opening a port again and again: later and later, and talked about once per change (spec section 2 and 5).
 
-It opens nothing itself. One thread uses it.
+How a port is opened is handed in. One thread uses it.
 """
 
 from __future__ import annotations
 
 import logging
-from typing import Final
+from collections.abc import Callable
+from threading import Event
+from typing import Final, TypeVar
 
 from gateway.clock import Clock
+from gateway.errors import LinkError
 
 FIRST_S: Final = 0.5
 MOST_S: Final = 30.0
+
+T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +35,16 @@ class Backoff:
     def wait_s(self) -> float:
         """Return how long not to open yet; 0 when it is time."""
         return max(0.0, self._due_s - self._clock.monotonic())
+
+    def attempt(self, open_it: Callable[[], T], ready: Event) -> T | None:
+        """Return what *open_it* opens, or None if it cannot: then why has been said. *ready* is set in any case."""
+        try:
+            return open_it()
+        except LinkError as error:
+            self.failed(str(error))
+            return None
+        finally:
+            ready.set()
 
     def failed(self, reason: str) -> bool:
         """Say so once, and wait longer each time. Returns True the first time since the line worked."""

@@ -142,6 +142,12 @@ def table_number(name: str) -> Table:
     return TABLES[name.replace("_", "-")]
 
 
+def meant_by_reference(table: Table, number: int) -> int | None:
+    """The PDU address that *number* stands for if it looks like a handbook's 40108; None where it does not."""
+    first = REFERENCE_FIRSTS.get(table)
+    return number - first if first is not None and first <= number < first + REFERENCES_EACH else None
+
+
 TableName = Annotated[str, AfterValidator(_table), _written(TABLES)]
 Passphrase = Annotated[Text, AfterValidator(_passphrase)]
 

@@ -20,6 +20,8 @@ from annotated_types import Ge, Gt, Le, MaxLen
 from pydantic import AfterValidator, AllowInfNan, BaseModel, BeforeValidator, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from gateway.plain_text import printable
+
 Path = tuple[str | int, ...]
 Severity = Literal["error", "warning", "note"]
 
@@ -191,8 +193,7 @@ def shown(value: object) -> str:
 
 def escaped(text: str, most: int = SHOWN_CHARACTERS) -> str:
     """*text* without control characters, cut behind *most* characters."""
-    cut = text if len(text) <= most else f"{text[:most]}..."
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
+    return printable(text if len(text) <= most else f"{text[:most]}...")
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> list[Finding]:

@@ -13,6 +13,8 @@ from collections import deque
 from datetime import datetime
 from typing import Any, Final
 
+from gateway.plain_text import printable
+
 KEPT: Final = 300  # lines that the menu can show
 LONGEST: Final = 2000  # characters of one message, and of one line that is kept
 
@@ -25,15 +27,11 @@ class SafeFormatter(logging.Formatter):
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the name is logging's
         """Return the first line, without a traceback."""
-        return _safe(super().formatMessage(record)[:LONGEST])
+        return printable(super().formatMessage(record)[:LONGEST])
 
     def formatException(self, ei: Any) -> str:  # noqa: N802 - the name is logging's, as is what stands in *ei*
         """Return a traceback; what its error tells of a name or a line is made safe as well."""
-        return _safe(super().formatException(ei), kept="\n")
-
-
-def _safe(text: str, kept: str = "") -> str:
-    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)
+        return printable(super().formatException(ei), kept="\n")
 
 
 class LogRing(logging.Handler):

@@ -116,13 +116,9 @@ class SerialSlave:
         if wait_s:
             self._waker.wait(min(wait_s, self._wait_limit_s))
             return
-        try:
-            self._link = self._open_link()
-        except LinkError as error:
-            self._opening.failed(str(error))
+        self._link = self._opening.attempt(self._open_link, self.ready)
+        if self._link is None:
             return
-        finally:
-            self.ready.set()
         self._silence_s = silence_s(self.config.baudrate, self._link.character_s)
         self._framer.reset()
         log.info("%s: listening on %s", self.name, self.config.line)

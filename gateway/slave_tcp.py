@@ -20,7 +20,6 @@ from gateway.backoff import Backoff
 from gateway.clock import Clock
 from gateway.config import SlaveConfig
 from gateway.counters import ServeCounters
-from gateway.errors import LinkError
 from gateway.link import Waker
 from gateway.link_tcp import is_allowed, set_tcp_options
 from gateway.modbus.framing import Frame, Framer, request_framer
@@ -139,13 +138,9 @@ class TcpSlave:
         self._close_idle()
 
     def _open(self) -> None:
-        try:
-            self._listener = self._listen()
-        except LinkError as error:
-            self._opening.failed(str(error))
+        self._listener = self._opening.attempt(self._listen, self.ready)
+        if self._listener is None:
             return
-        finally:
-            self.ready.set()
         self._opening.worked()
         self.port = self._listener.getsockname()[1]
         self._selector.register(self._listener, selectors.EVENT_READ)

@@ -19,21 +19,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from gateway import config_fields, toml_text
-from gateway.config import FUNCTION_CODES, NATURAL_TABLES, Config
+from gateway.config import FUNCTION_CODES, NATURAL_TABLES, TABLE_NAMES, Config, meant_by_reference
 from gateway.config_checks import not_yet, validate
 from gateway.config_fields import Finding, Severity
 from gateway.errors import ConfigError
-from gateway.modbus.pdu import Table
 
 LARGEST_FILE_BYTES: Final = 1024 * 1024
 BYTE_ORDER_MARK: Final = "\ufeff"
 NAME_CHARACTERS: Final = 255  # of a file that are shown
 
-REFERENCES: Final = {  # how handbooks number points; coils (1 to 9999) cannot be told from addresses
-    Table.DISCRETE_INPUTS: (10001, "discrete input"),
-    Table.INPUT_REGISTERS: (30001, "input register"),
-    Table.HOLDING_REGISTERS: (40001, "holding register"),
-}
 
 _TOML_PLACE: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _DECIMAL: Final = re.compile(r"\+?[0-9][0-9_]*")
@@ -180,13 +174,12 @@ def _confused(number: int, function: object) -> str | None:
     """What is said of the address *number* if it is likely to be a reference number of *function*'s table."""
     code = FUNCTION_CODES.get(function.replace("_", "-")) if isinstance(function, str) else function
     table = NATURAL_TABLES.get(code) if type(code) is int else None
-    if table not in REFERENCES:
+    meant = None if table is None else meant_by_reference(table, number)
+    if table is None or meant is None:
         return None
-    first, point = REFERENCES[table]
-    if not first <= number < first + 9999:
-        return None
+    point = TABLE_NAMES[table].removesuffix("s").replace("-", " ")
     return (
-        f"address {number} looks like a reference number: for {point} {number} type address = {number - first}; "
+        f"address {number} looks like a reference number: for {point} {number} type address = {meant}; "
         f"if PDU address {number} is really meant, type 0x{number:04X}"
     )
 

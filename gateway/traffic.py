@@ -23,10 +23,11 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from gateway.clock import Clock
-from gateway.modbus.describe import cut, describe_reply, describe_request
+from gateway.modbus.describe import describe_reply, describe_request
 from gateway.modbus.framing import Frame, Framing
 from gateway.modbus.pdu import BROADCAST, EXCEPTION_BIT, REPLY_SHAPES, pdu_length
 from gateway.modbus.pieces import BOTH, CUTTERS, REPLIES, REQUESTS, Piece
+from gateway.plain_text import cut
 
 CHUNKS_MAX: Final = 500  # told and not taken yet
 BYTES_MAX: Final = 32768  # the same, in bytes

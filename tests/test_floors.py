@@ -15,6 +15,7 @@ FLOORS = [  # from the ground up; within a floor, in the order they may build on
     [
         "errors",
         "clock",
+        "plain_text",
         "counters",
         "schedule",
         "backoff",

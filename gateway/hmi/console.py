@@ -150,13 +150,9 @@ class SerialConsole:
         if wait_s:
             self._waker.wait(min(wait_s, self._wait_limit_s))
             return
-        try:
-            self._link = self._open_link()
-        except LinkError as error:
-            self._opening.failed(str(error))
+        self._link = self._opening.attempt(self._open_link, self.ready)
+        if self._link is None:
             return
-        finally:
-            self.ready.set()
         self._bytes = MarkedBytes()
         self._session = Session(self._shared, "serial console", Rank.SERIAL, "serial console", self.wake)
         self._session.start()

@@ -19,7 +19,8 @@ from typing import Final, TypeVar
 
 from gateway.clock import Clock
 from gateway.hmi.keys import ENTER, ESC, LineEditor, Outcome
-from gateway.hmi.wording import cut, without_accents
+from gateway.hmi.wording import without_accents
+from gateway.plain_text import cut, printable
 
 LINE_LIMIT: Final = 8  # characters; more of them lead back to the main menu (original)
 TYPED_AHEAD_MOST: Final = 100  # keys kept while a job runs
@@ -279,11 +280,6 @@ class Ui:
         if not is_done():
             yield Await(is_done, self.clock.monotonic() + limit_s)
         return is_done()
-
-
-def printable(text: str) -> str:
-    """Return *text* with whatever cannot be printed escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def seconds_text(seconds: float) -> str:

@@ -21,7 +21,6 @@ from typing import Final, Protocol
 
 from gateway.backoff import Backoff
 from gateway.clock import Clock
-from gateway.errors import LinkError
 from gateway.hmi.seat import Rank
 from gateway.hmi.session import Session, Shared
 from gateway.hmi.telnet import TelnetFilter
@@ -217,21 +216,13 @@ class Terminals:
     def _open_if_due(self) -> None:
         now_s = self._clock.monotonic()
         if self._listener is None and not self._opening.wait_s():
-            self._open()
+            self._opening.attempt(self._start_listening, self.ready)
         elif self._listener is not None and self._accepts_again_s is not None and now_s >= self._accepts_again_s:
             self._accepts_again_s = None
             self._selector.register(self._listener, selectors.EVENT_READ)
 
-    def _open(self) -> None:
-        try:
-            self._start_listening(self._listen())
-        except LinkError as error:
-            self._opening.failed(str(error))
-        finally:
-            self.ready.set()
-
-    def _start_listening(self, listener: socket.socket) -> None:
-        self._listener = listener
+    def _start_listening(self) -> None:
+        listener = self._listener = self._listen()
         self._opening.worked()
         self._selector.register(listener, selectors.EVENT_READ)
         name = listener.getsockname()

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from datetime import datetime
 from typing import Final
 
-from gateway.config import REFERENCE_FIRSTS, REFERENCES_EACH
+from gateway.config import REFERENCES_EACH, meant_by_reference
 from gateway.modbus.pdu import Table
 
 Translate = Callable[[str], str]
@@ -91,11 +91,6 @@ def time_text(wall_s: float) -> str:
     return datetime.fromtimestamp(wall_s).strftime("%H:%M:%S")  # the station's own time
 
 
-def cut(text: str, columns: int) -> str:
-    """Return *text* in at most *columns* characters; ".." stands for what was cut off."""
-    return text if len(text) <= columns else text[: max(0, columns - 2)] + ".."[:columns]
-
-
 def signed(value: int) -> int:
     """Return a register as a two's complement number."""
     return value - 0x10000 if value & 0x8000 else value
@@ -125,10 +120,8 @@ def plain_reference_problem(table: Table, text: str, _: Translate) -> str | None
 
 def reference_problem(table: Table, number: int, _: Translate) -> str | None:
     """Return what to say of *number*, typed where an address is meant, if it looks like a handbook's 40108."""
-    if table not in REFERENCE_FIRSTS:
-        return None
-    first = REFERENCE_FIRSTS[table]
-    if not first <= number < first + REFERENCES_EACH:
+    meant = meant_by_reference(table, number)
+    if meant is None:
         return None
     told = _("{number} looks like a reference number: for it type {address}; for the address, 0x{number:04X}.")
-    return told.format(number=number, address=number - first)
+    return told.format(number=number, address=meant)

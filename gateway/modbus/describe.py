@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gateway.modbus.pdu import COIL_OFF, COIL_ON, EXCEPTION_BIT, REPLY_SHAPES, REQUEST_SHAPES, pdu_length, word_at
+from gateway.plain_text import cut
 
 WIDTH: Final = 60
 
@@ -52,11 +53,6 @@ def describe_reply(pdu: bytes) -> str:
     words = _REPLIES.get(pdu[0]) if pdu else None
     is_whole = len(pdu) == pdu_length(REPLY_SHAPES, pdu)
     return cut(words(pdu), WIDTH) if words and is_whole else _unknown(pdu, _REPLIES)
-
-
-def cut(text: str, width: int) -> str:
-    """Return *text*, or as much of its start as fits in *width* characters together with '..'."""
-    return text if len(text) <= width else (text[: max(0, width - 2)] + "..")[: max(0, width)]
 
 
 def _unknown(pdu: bytes, known: dict[int, Callable[[bytes], str]]) -> str:

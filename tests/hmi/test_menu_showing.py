@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.hmi.keys import ENTER, ESC
-from gateway.hmi.menu import TYPED_AHEAD_MOST, AskKey, AskLine, Back, Dialogue, Menu, Ui, printable
+from gateway.hmi.menu import TYPED_AHEAD_MOST, AskKey, AskLine, Back, Dialogue, Menu, Ui
+from gateway.plain_text import printable
 from tests.fakes import JumpingClock
 from tests.hmi.person import Main, Person, person_asked
 

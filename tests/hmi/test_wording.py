@@ -12,7 +12,6 @@ from gateway.hmi.wording import (
     N_,
     ORDERS,
     age_text,
-    cut,
     duration_text,
     ordered,
     point_name,
@@ -25,6 +24,7 @@ from gateway.hmi.wording import (
     without_accents,
 )
 from gateway.modbus.pdu import Table
+from gateway.plain_text import cut
 
 HOLDING, INPUT, DISCRETE, COILS = Table.HOLDING_REGISTERS, Table.INPUT_REGISTERS, Table.DISCRETE_INPUTS, Table.COILS
 

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.modbus.describe import WIDTH, cut, describe_reply, describe_request, exception_name
+from gateway.modbus.describe import WIDTH, describe_reply, describe_request, exception_name
 from gateway.modbus.pdu import REPLY_SHAPES, REQUEST_SHAPES, ExceptionCode, Function
+from gateway.plain_text import cut
 from tests.modbus import wire
 
 REQUESTS = [

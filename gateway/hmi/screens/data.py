@@ -12,7 +12,6 @@ from gateway.hmi.wording import (
     ORDERS,
     Translate,
     age_text,
-    cut,
     ordered,
     plain_reference_problem,
     point_name,
@@ -23,6 +22,7 @@ from gateway.hmi.wording import (
     table_name,
 )
 from gateway.modbus.pdu import Span, Table, pack_bits, pack_words
+from gateway.plain_text import cut
 from gateway.register import DataRegister, Quality, Sample, Source, SourceKind
 
 WIDE_LIMIT: Final = 20  # characters of a 32-bit value

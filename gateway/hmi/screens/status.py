@@ -10,7 +10,8 @@ from gateway.hmi.menu import HELP, AskKey, Dialogue, Ui
 from gateway.hmi.screens.requests import error_name, state_name
 from gateway.hmi.screens.settings import ask_line_of, format_text
 from gateway.hmi.station import LineView, MasterView, SlaveView, Station
-from gateway.hmi.wording import age_text, cut, duration_text
+from gateway.hmi.wording import age_text, duration_text
+from gateway.plain_text import cut
 from gateway.polls import Poll
 
 STATUS_EVERY_S: Final = 2.0

@@ -13,8 +13,9 @@ from typing import Final
 
 from gateway.clock import Clock
 from gateway.hmi.menu import Ui
-from gateway.hmi.wording import Translate, cut, reference, table_name, time_text
+from gateway.hmi.wording import Translate, reference, table_name, time_text
 from gateway.modbus.pdu import bit_at, word_at
+from gateway.plain_text import cut
 from gateway.register import DataRegister, Written
 
 KEPT: Final = 100  # writes that wait to be shown
