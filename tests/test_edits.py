@@ -244,10 +244,14 @@ class Terminal:
 @contextmanager
 def terminal(place: Place) -> Iterator[Terminal]:
     with pty_pair() as pty:
+        before = signal.signal(
+            signal.SIGINT, signal.default_int_handler
+        )  # tests in the background ignore it: inherited
         made = Terminal(pty, place)
         try:
             yield made
         finally:
+            signal.signal(signal.SIGINT, before)
             made.process.kill()
             made.process.communicate()
 
