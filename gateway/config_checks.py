@@ -75,7 +75,6 @@ def not_yet(config: Config) -> list[Finding]:
     """Return a warning for everything in *config* that this version accepts and does not carry out."""
     asked: list[tuple[Path, bool]] = [
         (("hmi", "wifly"), bool(config.hmi.wifly.line)),
-        (("watchdog", "device"), bool(config.watchdog.device)),
     ]
     asked += [(("io", i), True) for i in range(len(config.io))]
     return [Finding(path, _not_carried_out(path), "warning") for path, is_asked in asked if is_asked]

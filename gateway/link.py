@@ -74,18 +74,25 @@ def wait_ready(reading: Sequence[int], writing: Sequence[int], timeout_s: float 
 class Waker:
     """Ends a wait in another thread; remembers one wake until it is cleared.
 
-    The lock keeps a late ``wake()`` from writing into a descriptor that was closed and given to someone else. One
-    thread can take it twice: a signal handler may interrupt a ``wake()`` with its own.
+    A wake is for one waiter, which clears it; the end is for all who wait, and stays. The lock keeps a late ``wake()``
+    from writing into a descriptor that was closed and given to someone else. One thread can take it twice: a signal
+    handler may interrupt a ``wake()`` with its own.
     """
 
     def __init__(self) -> None:
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._end_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._lock = threading.RLock()
+        self._waiters = 0  # in other threads, that need the descriptor of the end
+        self._is_closing = False
         self.ended = False  # True: every wait ends at once, for good
 
     def end(self) -> None:
         """End the present wait and all that follow: the thread that waits is to stop. From any thread."""
         self.ended = True
+        with self._lock:
+            if self._end_fd >= 0:
+                os.eventfd_write(self._end_fd, 1)
         self.wake()
 
     def wake(self) -> None:
@@ -112,12 +119,37 @@ class Waker:
             self.clear()
         return woken
 
-    def close(self) -> None:
-        """Give the descriptor back; calling again does nothing."""
+    def rest(self, timeout_s: float) -> bool:
+        """``wait``, for a task that has nothing else to do; False if there was nothing to wait for either."""
+        return self.wait(timeout_s) or timeout_s > 0.0
+
+    def wait_for(self, reading: Sequence[int], writing: Sequence[int], timeout_s: float) -> list[int]:
+        """``wait_ready`` that no wake ends, only the end: then []. For a thread that works for the one that waits."""
         with self._lock:
+            if self.ended or self._is_closing:
+                return []
+            self._waiters += 1
+        try:
+            return [fd for fd in wait_ready((*reading, self._end_fd), writing, timeout_s) if fd != self._end_fd]
+        finally:
+            with self._lock:
+                self._waiters -= 1
+                self._close_end()
+
+    def close(self) -> None:
+        """Give the descriptors back; calling again does nothing."""
+        with self._lock:
+            self._is_closing = True
             if self._fd >= 0:
                 os.close(self._fd)
                 self._fd = -1
+            self._close_end()
+
+    def _close_end(self) -> None:
+        """Nobody may wait on a number that was given to someone else meanwhile."""
+        if self._is_closing and not self._waiters and self._end_fd >= 0:
+            os.close(self._end_fd)
+            self._end_fd = -1
 
 
 class Link(Protocol):

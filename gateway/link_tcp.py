@@ -16,9 +16,9 @@ import socket
 import threading
 from collections.abc import Sequence
 
-from gateway.clock import Clock, SystemClock
+from gateway.clock import Clock
 from gateway.errors import LinkUnavailable
-from gateway.link import DescriptorLink, Link, Waker, plain_reason, wait_ready
+from gateway.link import DescriptorLink, Link, Waker, plain_reason
 
 _TCP_OPTIONS = {socket.TCP_NODELAY: 1, socket.TCP_USER_TIMEOUT: 30_000}  # ms
 _TCP_OPTIONS |= {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}  # s, s, probes
@@ -27,8 +27,9 @@ _LISTEN_REASONS = {
     errno.EADDRNOTAVAIL: "this machine does not have this address",
 }
 
+NAME_LIMIT_S = 60.0  # for the look-up of a name (section 7)
+
 _Address = tuple[socket.AddressFamily, socket.SocketKind, int, str, tuple[str | int | bytes, ...]]
-_CLOCK = SystemClock()
 
 
 def set_tcp_options(connection: socket.socket) -> None:
@@ -47,15 +48,17 @@ def is_allowed(host: str, networks: Sequence[str]) -> bool:
     return not networks or any(address in ipaddress.ip_network(network) for network in networks)
 
 
-def connect_tcp(host: str, port: int, waker: Waker, clock: Clock, timeout_s: float) -> Link:
+def connect_tcp(
+    host: str, port: int, waker: Waker, clock: Clock, timeout_s: float, name_limit_s: float = NAME_LIMIT_S
+) -> Link:
     """Connect to a device; every address of a name gets its share of *timeout_s*.
 
-    A wake does not stop it, only the waker's end.
+    A wake does not stop it, only the waker's end. The name itself is looked up within *name_limit_s*.
     raises: LinkUnavailable: refused, no answer in time, name not known, or ended by the waker.
     """
     name = _tcp_name(host, port)
+    addresses = _addresses(name, host, port, waker, name_limit_s)
     deadline = clock.monotonic() + timeout_s
-    addresses = _addresses(name, host, port, waker, timeout_s)
     reasons, reason = {errno.ETIMEDOUT: f"no answer within {timeout_s:g} s"}, ""
     for tried, address in enumerate(addresses):
         share_s = (deadline - clock.monotonic()) / (len(addresses) - tried)
@@ -90,14 +93,10 @@ def _wait_unless_ended(
     name: str, waker: Waker, reading: Sequence[int], writing: Sequence[int], timeout_s: float
 ) -> list[int]:
     """``wait_ready`` that a wake does not end, only the waker's end."""
-    deadline_s = _CLOCK.monotonic() + timeout_s
-    while True:
-        ready = wait_ready((*reading, waker.fileno()), writing, max(0.0, deadline_s - _CLOCK.monotonic()))
-        if waker.ended:
-            raise LinkUnavailable(f"{name}: interrupted")
-        if waker.fileno() not in ready or len(ready) > 1:
-            return [fd for fd in ready if fd != waker.fileno()]
-        waker.clear()
+    ready = waker.wait_for(reading, writing, max(0.0, timeout_s))
+    if waker.ended:
+        raise LinkUnavailable(f"{name}: interrupted")
+    return ready
 
 
 def listen_tcp(host: str, port: int, waker: Waker | None = None) -> socket.socket:
@@ -108,7 +107,7 @@ def listen_tcp(host: str, port: int, waker: Waker | None = None) -> socket.socke
     """
     name = _tcp_name(host, port)
     with contextlib.closing(Waker()) as never_ended:
-        family, *_, where = _addresses(name, host, port, waker or never_ended, timeout_s=5.0)[0]
+        family, *_, where = _addresses(name, host, port, waker or never_ended, NAME_LIMIT_S)[0]
     try:
         listener = socket.create_server(where, family=family, backlog=128)  # SO_REUSEADDR, IPV6_V6ONLY
     except OSError as error:
@@ -121,7 +120,7 @@ def _tcp_name(host: str, port: int) -> str:
     return f"tcp [{host}]:{port}" if ":" in host else f"tcp {host}:{port}"
 
 
-def _addresses(name: str, host: str, port: int, waker: Waker, timeout_s: float) -> Sequence[_Address]:
+def _addresses(name: str, host: str, port: int, waker: Waker, limit_s: float) -> Sequence[_Address]:
     """All addresses of *host*: at once if it is written in digits, else from the resolver.
 
     The resolver is asked in a thread of its own, so that it delays neither the timeout nor a stop. That thread owns
@@ -142,11 +141,11 @@ def _addresses(name: str, host: str, port: int, waker: Waker, timeout_s: float) 
 
     threading.Thread(target=ask, name="resolver", daemon=True).start()
     try:
-        ready = _wait_unless_ended(name, waker, (done,), (), timeout_s)
+        ready = _wait_unless_ended(name, waker, (done,), (), limit_s)
     finally:
         os.close(done)
     if not ready:
-        raise LinkUnavailable(f"{name}: no name server answers within {timeout_s:g} s")
+        raise LinkUnavailable(f"{name}: no name server answers within {limit_s:g} s")
     if not found:
         raise LinkUnavailable(f"{name}: name is not known, or its name server does not answer")
     return found

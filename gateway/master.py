@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from gateway.backoff import Backoff
 from gateway.clock import Clock
 from gateway.commands import Command, CommandQueue
 from gateway.config import MasterConfig
@@ -24,6 +23,7 @@ from gateway.counters import PollCounters
 from gateway.errors import LinkError
 from gateway.link import Link, Waker
 from gateway.modbus.pdu import AnyRequest
+from gateway.opening import Opening, Start, at_once
 from gateway.polls import Device, Poll, ProbeBudget, StatusPoints, count_response, polls_of, take_points, timing_of
 from gateway.register import DataRegister
 from gateway.schedule import Schedule
@@ -60,8 +60,9 @@ class Master:
         open_link: Callable[[], Link],
         wait_limit_s: float = 3.0,
         late_s: dict[str, float] | None = None,
+        start: Start = at_once,
     ) -> None:
-        """*open_link* opens the line, or raises LinkError; it may take a while but must heed *waker*.
+        """*open_link* opens the line, or raises LinkError; *start* has that done, here or in another thread.
 
         late_s: until when a late reply may come on a port (monotonic), shared by all that use it."""
         self.name = config.name
@@ -75,13 +76,13 @@ class Master:
         self._register = register
         self._clock = clock
         self._waker = waker
-        self._open_link = open_link
         self._late_s = {} if late_s is None else late_s
         self._wait_limit_s = wait_limit_s
         self._opened: _Opened | None = None
-        self._opening = Backoff(config.name, clock)
+        self._opening = Opening(config.name, clock, open_link, waker, start)
         self._is_resting = False  # a connection that worked and was closed: opened again when there is work for it
         self._busy_since_s: float | None = None  # since when the line has not been silent
+        self._listens_since_s: float | None = None  # since when nothing was sent because somebody else may speak
         self._schedule = Schedule([poll.config.every for poll in self.polls if poll.is_scheduled])
         self._scheduled = self._online = sum(device.polls for device in self.devices.values())  # as bits
         self._offline: set[Device] = set()
@@ -143,14 +144,15 @@ class Master:
         self._stopping, self._alive = stop.is_set, alive
         try:
             while not stop.is_set():
-                alive()
-                self.step()
+                if self.step():
+                    alive()
         finally:
             self.close()
 
     def close(self) -> None:
         """Let go of the line, the register's points and the commands."""
         self._let_go()
+        self._opening.close()
         if len(self._queue):
             log.warning("%s: %d writes are not delivered: the line stops or is made anew", self.name, len(self._queue))
         for undo in self._undo:
@@ -158,45 +160,55 @@ class Master:
         self._undo.clear()
         self._tickets.close()
 
-    def step(self) -> None:
-        """Do one thing: a command, a poll, a probe, opening the line; or wait for the next."""
+    def step(self) -> bool:
+        """Do one thing: a command, a poll, a probe, opening the line; or wait for the next. False: neither of them."""
         self._expire()
         self._status.show_all(self._clock.monotonic(), not self.enabled)
         if not self.enabled:
             self.ready.set()
             self._let_go()
-            self._waker.wait(self._wait_s())
-        elif self._opened is None:
-            self._open()
-        else:
-            try:
-                self._work(self._opened)
-            except LinkError as error:
-                self._broke(str(error))
-            else:
-                if self._opened is not None and not self.config.is_tcp and self._opening.trouble:
-                    self._opening.worked()  # a port has to carry something first; a connection, an answer
+            return self._waker.rest(self._wait_s())
+        if self._opened is None:
+            return self._open()
+        try:
+            has_got_on = self._work(self._opened)
+        except LinkError as error:
+            self._broke(str(error))
+            return True
+        if self._opened is not None and not self.config.is_tcp and self._opening.trouble:
+            self._opening.worked()  # a port has to carry something first; a connection, an answer
+        return has_got_on
 
-    def _work(self, opened: _Opened) -> None:
+    def _work(self, opened: _Opened) -> bool:
         if self.config.is_tcp and opened.silent_in_row >= SILENT_TCP_LIMIT:
             self._renew("nothing answers")
-            return
+            return True
         line = opened.line
         if not line.is_free or (line.silent_in_s() and not self._is_never_silent()):
-            self._listen(line)
-            return  # nothing is taken before it can be sent at once: a newer value may come meanwhile
-        self._busy_since_s = None
+            return self._listen(
+                line
+            )  # nothing is taken before it can be sent at once: a newer value may come meanwhile
+        self._busy_since_s = self._listens_since_s = None
         if self.config.is_tcp:
             line.advance(0.0)  # a device that has hung up after its last reply fails no request
         if self._carry_out_command(line) or self._carry_out_probe(line) or self._carry_out_poll(line):
-            return
-        line.advance(self._wait_s())
+            return True
+        wait_s = self._wait_s()
+        line.advance(wait_s)
+        return wait_s > 0.0
 
-    def _listen(self, line: Line) -> None:
-        """Let a spoiled line, or the silence before the next request, get on: that is time in use, too."""
+    def _listen(self, line: Line) -> bool:
+        """Let a spoiled line, or the silence before the next request, get on; False if it goes on for too long.
+
+        That is time in use, too."""
         began_s = self._clock.monotonic()
+        if self._listens_since_s is None:
+            self._listens_since_s = began_s
         line.advance(min(line.silent_in_s() or self._wait_limit_s, self._wait_limit_s))
-        self.busy_s += self._clock.monotonic() - began_s
+        now_s = self._clock.monotonic()
+        self.busy_s += now_s - began_s
+        over_by_s = max(line.late_until_s, self._listens_since_s + self.config.response_timeout + self.config.delay)
+        return now_s <= over_by_s + self._wait_limit_s
 
     def _is_never_silent(self) -> bool:
         """True when the line has babbled for a whole response timeout: polls then fail, and say so."""
@@ -218,19 +230,17 @@ class Master:
 
     # -------------------------------------------------------------------------------------------- the line
 
-    def _open(self) -> None:
+    def _open(self) -> bool:
         wait_s = self._opening.wait_s()
         if wait_s or (self._is_resting and not self._is_work_due()):
-            self._waker.wait(min(self._wait_s(), wait_s or self._wait_limit_s))
-            return
-        try:
-            link = self._open_link()
-        except LinkError as error:
-            if not self._waker.ended:
-                self._lost(str(error))
-            return
-        finally:
-            self.ready.set()
+            return self._waker.rest(min(self._wait_s(), wait_s or self._wait_limit_s))
+        link = self._opening.attempt(self.ready, self._lost)
+        if link is not None:
+            self._take(link)
+        return True
+
+    def _take(self, link: Link) -> None:
+        """Work on this line from now on."""
         log.debug("%s: polling on %s", self.name, self.config.line)
         timing = timing_of(self.config, link.character_s)
         late_until_s = self._late_s.get(self.config.line, 0.0)
@@ -303,8 +313,8 @@ class Master:
             self._probe(line, device, device in wanted) for device in self._probes.in_turn(self._offline, wanted)
         )
         while self._has(line) and not line.is_free and not self._stopping():
-            self._alive()
-            self._listen(line)
+            if self._listen(line):
+                self._alive()
         least_s = PROBE_LEAST_S if self._has(line) else self.config.response_timeout  # a connection has its price
         self._probes.spent(began_s, max(self._clock.monotonic(), began_s + least_s))
         return is_sent
@@ -317,7 +327,7 @@ class Master:
         """Send what there is for *device*; False if there is nothing."""
         others = {outlet for outlet in self._by_outlet if outlet not in device.outlets}
         command = self._queue.take(others) if is_wanted else None
-        polls = 0 if command else self._sendable(device)
+        polls = 0 if command else device.sendable(self.polls, self._queue)
         if command is None and not polls:
             return False
         self._probes.picked(device, is_wanted)
@@ -327,15 +337,6 @@ class Master:
             index = self._schedule.pick(self._clock.monotonic(), polls)
             self._send_poll(line, self._schedule.next_in_turn(polls) if index is None else index)
         return True
-
-    def _sendable(self, device: Device) -> int:
-        """Return the scheduled requests of *device*, as bits, without the writes that have no values yet."""
-        bits = 0
-        for index, poll in enumerate(self.polls):
-            is_its = device.polls >> index & 1
-            if is_its and (poll.outlet is None or self._queue.cyclic_values(poll.outlet)):
-                bits |= 1 << index
-        return bits
 
     def _carry_out_poll(self, line: Line) -> bool:
         index = self._poll_due()
@@ -444,7 +445,8 @@ class Master:
             line.send(unit, request, timeout_s)
             while response is None and not self._stopping():
                 response = line.advance(self._wait_limit_s)
-                self._alive()
+                if self._clock.monotonic() <= line.over_by_s + self._wait_limit_s:
+                    self._alive()
         except LinkError as error:  # no answer either: whose request ends every connection is offline in the end
             if self.config.is_tcp and self._online:  # of no concern to those who answer
                 self._renew(str(error))
@@ -473,9 +475,7 @@ class Master:
             log.warning("%s: unit %d is offline: %s", self.name, device.unit, response.reason)
             self._offline.add(device)
             self._online &= ~device.polls
-            for poll in self.polls:
-                if poll.device is device:
-                    poll.spoil(self._register)
+            device.spoil(self.polls, self._register)
 
     def _back(self, device: Device) -> None:
         log.warning("%s: unit %d is back", self.name, device.unit)

@@ -56,6 +56,21 @@ class Device:
         self.is_offline |= goes_offline
         return goes_offline
 
+    def spoil(self, polls: Sequence[Poll], register: DataRegister) -> None:
+        """Mark the points of those of *polls* that are its own as bad."""
+        for poll in polls:
+            if poll.device is self:
+                poll.spoil(register)
+
+    def sendable(self, polls: Sequence[Poll], queue: CommandQueue) -> int:
+        """Return its scheduled requests, as bits in *polls*, without the writes that have no values yet."""
+        bits = 0
+        for index, poll in enumerate(polls):
+            is_its = self.polls >> index & 1
+            if is_its and (poll.outlet is None or queue.cyclic_values(poll.outlet)):
+                bits |= 1 << index
+        return bits
+
 
 @dataclass(eq=False)
 class Poll:

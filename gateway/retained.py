@@ -14,9 +14,9 @@ and again writes nothing; none while the values are what the file says. A power 
 
 What it refuses: choosing the tables and the points that are left out (``wiring``).
 
-Threads: ``restore`` and ``forget`` belong to the main thread, while no task runs; the ``Retainer`` has one of its own,
-and another while it writes: a card that takes its time must not look like a task that hangs. The watcher runs in the
-threads that write the register, and only leaves a mark.
+Threads: ``restore`` and ``forget`` belong to the main thread, while no task runs; the ``Retainer`` has one of its own.
+Whatever waits for the disk is done in yet another: a card that takes its time must not look like a thread that hangs.
+The watcher runs in the threads that write the register, and only leaves a mark.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ EVERY_S: Final = 60.0
 LOOK_EVERY_S: Final = 3.0
 ANSWER_LIMIT_S: Final = 60.0  # of the disk, then it is an alarm (spec section 7)
 STOP_LIMIT_S: Final = 1.5  # for the last write; a clean stop takes under 2 s (spec section 7)
+FORGET_LIMIT_S: Final = 0.5  # the main thread has others to look after
 
 MAGIC: Final = b"rtugate values\0\1"  # the last byte: number of the format
 HEADER: Final = struct.Struct(">QI")  # wall time of the save in whole seconds since 1970; number of blocks
@@ -166,6 +167,7 @@ class RetainedFile:
         self.path = path
         self.said: Values | None = []
         self.trouble = ""
+        self._turn = threading.Lock()  # a write that the disk holds up must not come after a newer one
 
     def restore(self, register: DataRegister, clock: Clock, tables: Sequence[Table]) -> None:
         """Bring the values of *tables* back; where the file cannot be used, say so and bring back none."""
@@ -185,20 +187,34 @@ class RetainedFile:
     def forget(self) -> None:
         """Nothing is to be retained: should that change one day, nothing old is to come back then."""
         self.said = []
-        with contextlib.suppress(PermissionError):  # what we cannot see, we could not read then either
+        is_done = threading.Event()
+
+        def work() -> None:
+            try:
+                self._remove()
+            finally:
+                is_done.set()
+
+        in_thread(work)
+        if not is_done.wait(FORGET_LIMIT_S):
+            log.warning("%s: %s is still there: the disk does not answer", TASK_NAME, self.path.name)
+
+    def write(self, content: bytes) -> None:
+        """Replace what there is, after any other write has come to its end; raises SaveError."""
+        with self._turn:
+            try:
+                self.path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
+            except OSError as error:
+                raise SaveError(f"{self.path.name} is not saved: {files.in_words(error, self.path)}") from error
+            files.write_atomically(self.path, content)
+
+    def _remove(self) -> None:
+        with self._turn, contextlib.suppress(PermissionError):  # what we cannot see, we could not read then either
             try:
                 if self.path.exists():
                     files.remove_durably(self.path)
             except SaveError as error:
                 log.warning("%s: %s", TASK_NAME, error)
-
-    def write(self, content: bytes) -> None:
-        """Replace what there is; raises SaveError."""
-        try:
-            self.path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
-        except OSError as error:
-            raise SaveError(f"{self.path.name} is not saved: {files.in_words(error, self.path)}") from error
-        files.write_atomically(self.path, content)
 
     def _read(self) -> Snapshot:
         """Raises SaveError; where there is no file there are no values."""
@@ -219,12 +235,16 @@ class RetainedFile:
 
 @dataclass
 class _Writing:
-    """One write on its way: *values* without their ages, since when, and what becomes of it."""
+    """One write on its way: *values* without their ages, since when, and what becomes of it.
+
+    is_given_up: it has taken too long, and the end does not wait for it.
+    """
 
     values: Values
     began_s: float
     problem: str = "it failed; the log says why"
     done: threading.Event = field(default_factory=threading.Event)
+    is_given_up: bool = False
 
 
 def in_thread(work: Callable[[], None]) -> None:
@@ -289,25 +309,35 @@ class Retainer:
         if self._writing is None and self._is_touched and now_s >= self._due_s:
             self._begin()
         elif self._writing is not None and now_s - self._writing.began_s >= ANSWER_LIMIT_S:
-            self._tell(f"{self._file.path.name} is not saved: the disk does not answer")
+            self._give_up(self._writing)
         self._settle()
         is_soon = self._writing is None and self._is_touched
         due_s = self._due_s - self._clock.monotonic() if is_soon else self._wait_limit_s
         self._waker.wait(max(0.0, min(due_s, self._wait_limit_s)))
 
     def save_last(self) -> None:
-        """Write what is not written yet, and see to its end; by whoever is the last to know of the register."""
-        if self._is_written() and self._begin():
-            self._is_written()
-        if self._writing is not None:
-            self._tell(f"{self._file.path.name} is not saved: the disk does not answer")
+        """Write what is not written yet, and see to its end; by whoever is the last to know of the register.
 
-    def _is_written(self) -> bool:
+        It takes STOP_LIMIT_S at most, and no time at all once the disk has not answered.
+        """
+        until_s = self._clock.monotonic() + STOP_LIMIT_S
+        if self._is_written(until_s) and self._begin():
+            self._is_written(until_s)
+
+    def _is_written(self, until_s: float) -> bool:
         """Wait for a write on its way; False if it does not come to an end."""
-        if self._writing is not None:
-            self._writing.done.wait(STOP_LIMIT_S)
+        writing = self._writing
+        if writing is not None and not writing.is_given_up:
+            writing.done.wait(max(0.0, until_s - self._clock.monotonic()))
         self._settle()
+        if self._writing is not None:
+            self._give_up(self._writing)
         return self._writing is None
+
+    def _give_up(self, writing: _Writing) -> None:
+        """Say that *writing* takes too long; should it end nevertheless, that is taken note of."""
+        writing.is_given_up = True
+        self._tell(f"{self._file.path.name} is not saved: the disk does not answer")
 
     def _written(self, written: Written) -> None:
         if written.span.table in self._points:

@@ -15,6 +15,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 from gateway.clock import Clock
@@ -27,14 +28,16 @@ from gateway.hmi.station import Job, Told
 from gateway.hmi.wording import N_
 from gateway.logs import LogRing
 from gateway.master import Master
+from gateway.restart_cause import SAFE_AFTER
 from gateway.retained import RetainedFile
+from gateway.safe_mode import SafeMode
 from gateway.slave import SerialSlave
 from gateway.slave_tcp import TcpSlave
 from gateway.supervisor import Plan, Supervisor
 from gateway.wiring import Station
 
 NOTICES_KEPT: Final = 5
-GOOD_AFTER_S: Final = 60.0  # of running without a failing task, a configuration has proved good
+GOOD_AFTER_S: Final = 60.0  # of running without a task that fails or hangs, a configuration has proved good
 STALE: Final = N_("the configuration was changed from elsewhere meanwhile: nothing was done, please look again")
 FAILED: Final = N_("it failed; the log says why")
 STOPS: Final = "rtugate stops"
@@ -60,9 +63,13 @@ class Gateway:
         self.wants_restart = False
         self.terminal_plans: Callable[[Config], list[Plan]] = lambda config: []  # noqa: ARG005 - set by whoever has some
         self.supervisor = Supervisor([], clock)
-        self.supervisor.chores.append(self._look_after_file)
-        self.last_restart = N_("not known")
-        self.background = Background("slow work")  # hashes, saves: one at a time
+        self.supervisor.chores += [self._look_after_file, self._look_after_safe_mode]
+        self.last_restart = Told(N_("not known"))
+        self.safe_mode = SafeMode(clock)
+        self.adopted: Callable[[Config], None] = lambda config: None  # noqa: ARG005 - told what runs, in the main thread
+        self.guards_alarms: Callable[[], list[Told]] = list
+        self.guards_state: Callable[[], Told | None] = lambda: None
+        self.background = Background("slow work", clock)  # hashes, saves: one at a time
         self._good_since_s = clock.monotonic()  # set before the configuration that it is about
         self._kept_good: Config | None = None
         self._unfinished: set[Job] = set()  # that wait for the supervisor
@@ -96,7 +103,9 @@ class Gateway:
 
     def alarms(self) -> list[Told]:
         """Return what a person should know of, worst first."""
-        found = list(self.file.alarms)
+        found = [*self._safe_mode_alarm(), *self.file.alarms, *self.guards_alarms()]
+        if slow := self.background.trouble:
+            found.append(Told(N_("{name}: {trouble}"), {"name": "rtugate", "trouble": slow}))
         for name, task in self.supervisor.tasks.items():
             trouble = str(getattr(task, "trouble", ""))
             if trouble:
@@ -194,6 +203,7 @@ class Gateway:
             if config is self._config:
                 self.supervisor.change(self._plans(config), lambda: self.station.adopt(config))
                 logging.getLogger("gateway").setLevel(config.log.level.upper())
+                self.adopted(config)
             with self._lock:
                 self._unfinished.discard(job)
             job.finish()
@@ -215,7 +225,48 @@ class Gateway:
             job.finish()
 
     def _plans(self, config: Config) -> list[Plan]:
-        return self.terminal_plans(config) + self.station.plans_for(config)
+        plans = self.station.plans_for(config)
+        if self.safe_mode.is_on:
+            plans = [replace(plan, enabled=False) for plan in plans]
+        return self.terminal_plans(config) + plans
+
+    # -------------------------------------------------------------------------------------------- safe mode
+
+    def watchdog_state(self) -> Told | None:
+        """Return how the hardware watchdog fares; None if there is to be none."""
+        return self.guards_state()
+
+    @property
+    def is_safe(self) -> bool:
+        """Whether it runs in safe mode: all lines in maintenance."""
+        return self.safe_mode.is_on
+
+    @property
+    def safe_left_s(self) -> float | None:
+        """How long until it tries once more by itself; None when not in safe mode."""
+        return self.safe_mode.left_s
+
+    def end_safe_mode(self, told: Callable[[], None] = lambda: None, row: int = 0) -> Job:
+        """Have all lines run as configured; *row* bad restarts count all the same."""
+        self.supervisor.submit(lambda: self._leave_safe_mode(row))
+        return self._put_to_work(self._config, Job(), told)
+
+    def _leave_safe_mode(self, row: int) -> None:
+        if self.safe_mode.end(row):
+            log.warning("safe mode is over: all lines run as configured")
+
+    def _look_after_safe_mode(self) -> float:
+        return self.safe_mode.look(self._try_once_more)
+
+    def _try_once_more(self) -> None:
+        self._notice(N_("Safe mode is over: all lines run as configured."))
+        self.end_safe_mode(row=SAFE_AFTER - 1)
+
+    def _safe_mode_alarm(self) -> list[Told]:
+        text = N_("safe mode: {count} bad restarts in a row; all lines are in maintenance")
+        return [Told(text, {"count": self.safe_mode.bad_in_row})] if self.safe_mode.is_on else []
+
+    # -------------------------------------------------------------------------------------------- what is due
 
     def _look_after_file(self) -> float:
         """Undo a save that nobody confirmed, keep what has proved good; return after how long to look again."""
@@ -226,9 +277,11 @@ class Gateway:
             return left_s or GOOD_AFTER_S
         config, settled = self._config, self.file.settled
         since_s = max(self._good_since_s, self.supervisor.failed_s or 0.0)
-        wait_s = since_s + GOOD_AFTER_S - self.clock.monotonic()
+        wait_s = since_s + max(GOOD_AFTER_S, config.watchdog.timeout) - self.clock.monotonic()
         if wait_s > 0:
             return wait_s
+        if self.safe_mode.is_on:  # it proves nothing
+            return GOOD_AFTER_S
         if settled is not None and settled is not self._kept_good and settled == config:
             self._kept_good = settled
             self.in_background(lambda: self._keep_good(settled), lambda: None)
@@ -290,6 +343,7 @@ class Gateway:
         def work() -> Config:
             saved = self.file.saved or self._first
             config = self._reloaded()
+            self.supervisor.submit(lambda: self._leave_safe_mode(0))
             if self._swap(config) != saved:
                 log.warning("%s: unsaved changes of the menu are dropped", self.path.name)
                 self._notice(N_("The file has been reloaded; unsaved changes of this menu are gone."))

@@ -22,9 +22,11 @@ from socket import socket
 from typing import Final
 
 from gateway import __version__
-from gateway.clock import SystemClock
+from gateway.clock import Clock, SystemClock
+from gateway.config import Config
 from gateway.config_file import ConfigFile
 from gateway.errors import GatewayError, LinkError
+from gateway.guard import Guard
 from gateway.hmi.access import Lockout
 from gateway.hmi.control import AlreadyRunning, open_control
 from gateway.hmi.menu import Menu, Ui
@@ -32,13 +34,18 @@ from gateway.hmi.screens.main import main_menu
 from gateway.hmi.screens.writes import WriteDisplay
 from gateway.hmi.seat import Seat
 from gateway.hmi.session import Shared
+from gateway.hmi.station import Job, Told
 from gateway.hmi.texts import translation
 from gateway.hmi.wording import Translate
-from gateway.logs import LogRing, SafeFormatter
+from gateway.logs import LogRing, RateLimited, console_formatter
 from gateway.restart_cause import BY_MENU, CLEAN, LastRun
 from gateway.retained import FILE_NAME, RetainedFile
 from gateway.running import Gateway
-from gateway.status import status
+from gateway.safe_mode import SafeMode
+from gateway.stacks import FILE_NAME as STACKS
+from gateway.stacks import Backstop, read_evidence
+from gateway.status import status, status_line
+from gateway.systemd import Systemd
 from gateway.wiring import control_plan, terminal_plans
 
 SIGNALS: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
@@ -51,38 +58,102 @@ log = logging.getLogger("gateway")
 def run_service(path: Path, state: Path, control_path: Path) -> int:
     """Run the gateway of the file at *path*; return the exit code. *state*: its folder for what it keeps."""
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # for all threads: one that comes waits until it is heeded
-    ring = _start_logging()
-    _make_state(state)
     clock = SystemClock()
+    ring, limiter = _start_logging(clock)
+    _make_state(state)
     try:
-        with _control_listener(control_path) as listen:
-            gateway = Gateway(ConfigFile(path, state, clock), clock, ring, RetainedFile(state / FILE_NAME))
-            is_clean = _run(gateway, LastRun(state), listen)
+        with _control_listener(control_path) as listen, _bugs_end_it():
+            service = _Service(path, state, clock, ring)
+            service.gateway.supervisor.chores.append(limiter.flush_due)
+            service.run(listen)
     except AlreadyRunning as error:
         log.error("%s", error)
         return 1
-    if gateway.wants_restart:
-        gateway.finish_work(WORK_LIMIT_S)  # a save would be cut off in the middle
+    if service.gateway.wants_restart:
+        service.gateway.finish_work(WORK_LIMIT_S)  # a save would be cut off in the middle
+        limiter.tell_rest()
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - ourselves, as we were called
-    return 0 if is_clean else 1
+    return 0
 
 
-def _run(gateway: Gateway, last_run: LastRun, listen: Callable[[], socket]) -> bool:
-    """Run *gateway* until a signal or its menu ends it; return whether all its tasks have ended."""
-    log.setLevel(gateway.config.log.level.upper())
-    shared = shared_of(gateway)
-    control = control_plan(shared, listen, {"reload": partial(_reload, gateway), "status": partial(status, gateway)})
-    gateway.terminal_plans = lambda config: terminal_plans(config, shared, control)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    config, gateway.last_restart = gateway.config, last_run.begin()
-    log.info("rtugate %s runs: %d masters, %d slaves", __version__, len(config.master), len(config.slave))
-    log.info("last restart: %s", gateway.last_restart)
-    with _signals_heeded(gateway):
-        is_clean = gateway.run()
-    if is_clean:
-        last_run.end(BY_MENU if gateway.wants_restart else CLEAN)
-    log.info("stopped")
-    return is_clean
+@contextlib.contextmanager
+def _bugs_end_it() -> Iterator[None]:
+    """A bug in the main thread ends the program at once, whatever other threads there still are."""
+    try:
+        yield
+    except BaseException:
+        log.critical("rtugate: ended with an error", exc_info=True)
+        os._exit(1)
+
+
+class _Service:
+    """The gateway, what guards it, and how it ended last."""
+
+    def __init__(self, path: Path, state: Path, clock: Clock, ring: LogRing) -> None:
+        self._last_run = LastRun(state)
+        beginning = self._last_run.begin(read_evidence(state / STACKS))
+        self.gateway = Gateway(ConfigFile(path, state, clock), clock, ring, RetainedFile(state / FILE_NAME))
+        self.gateway.last_restart = beginning.cause
+        count = beginning.bad_in_row
+        self.gateway.safe_mode = SafeMode(clock, count, self._last_run.lasted, self._last_run.forgiven)
+        self._guard = Guard(
+            self.gateway.supervisor,
+            clock,
+            self._last_run,
+            Backstop(state / STACKS),
+            Systemd.from_environment(clock),
+            lambda: self.gateway.wants_restart,
+        )
+
+    def run(self, listen: Callable[[], socket]) -> None:
+        """Run until a signal or the menu ends it. A task that does not end then ends the process."""
+        if not self._run(listen):
+            self._guard.did_not_stop()
+        self._guard.close()
+        self._last_run.end(BY_MENU if self.gateway.wants_restart else CLEAN)
+        log.info("stopped")
+
+    def _run(self, listen: Callable[[], socket]) -> bool:
+        gateway, guard = self.gateway, self._guard
+        shared = shared_of(gateway)
+        control = control_plan(shared, listen, {"reload": self._reload_now, "status": partial(status, gateway)})
+        gateway.terminal_plans = lambda config: terminal_plans(config, shared, control)
+        gateway.adopted, gateway.guards_alarms = self._adopt, guard.alarms
+        log.setLevel(gateway.config.log.level.upper())
+        gateway.guards_state, guard.has_reset = guard.device_state, self._was_reset
+        guard.status = partial(status_line, gateway)
+        self._adopt(gateway.config)
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        config = gateway.config
+        log.info("rtugate %s runs: %d masters, %d slaves", __version__, len(config.master), len(config.slave))
+        log.info("last restart: %s", gateway.last_restart.words(str))
+        if gateway.is_safe:
+            count = gateway.safe_mode.bad_in_row
+            log.error("safe mode: %d bad restarts in a row; all lines are in maintenance", count)
+        with _signals_heeded(gateway, self._reload):
+            return gateway.run()
+
+    def _adopt(self, config: Config) -> None:
+        self._guard.configure(config.watchdog)
+
+    def _was_reset(self, cause: Told) -> None:
+        self.gateway.last_restart = cause
+        log.info("last restart: %s", cause.words(str))
+
+    def _reload(self) -> Job:
+        """Load the file anew; systemd is told when that begins and ends. From any thread."""
+        submit, systemd = self.gateway.supervisor.submit, self._guard.systemd
+        submit(systemd.reloading)
+        return self.gateway.reload(lambda: submit(systemd.ready))
+
+    def _reload_now(self, _argument: str) -> str:
+        """The control socket's command: load the file anew, and say how that went."""
+        job = self._reload()
+        if not job.done.wait(WORK_LIMIT_S):
+            raise GatewayError("this takes unusually long; see the log")
+        if job.problem:
+            raise GatewayError(job.problem)
+        return "reloaded"
 
 
 def _make_state(state: Path) -> None:
@@ -91,12 +162,20 @@ def _make_state(state: Path) -> None:
         state.mkdir(mode=0o750, parents=True, exist_ok=True)
 
 
-def _start_logging() -> LogRing:
+def _start_logging(clock: Clock) -> tuple[LogRing, RateLimited]:
     ring, console = LogRing(), logging.StreamHandler(sys.stderr)
-    console.setFormatter(SafeFormatter())
-    logging.basicConfig(handlers=[console, ring], level=logging.WARNING)
+    console.setFormatter(console_formatter(os.environ.get("JOURNAL_STREAM", ""), _stat_of_stderr()))
+    limiter = RateLimited(clock, [console, ring])
+    logging.basicConfig(handlers=[limiter], level=logging.WARNING)
     log.setLevel(logging.INFO)
-    return ring
+    return ring, limiter
+
+
+def _stat_of_stderr() -> os.stat_result | None:
+    try:
+        return os.fstat(sys.stderr.fileno())
+    except (OSError, AttributeError):  # closed from the start
+        return None
 
 
 @contextlib.contextmanager
@@ -147,23 +226,13 @@ def shared_of(gateway: Gateway) -> Shared:
     )
 
 
-def _reload(gateway: Gateway, _argument: str) -> str:
-    """The control socket's command: load the file anew, and say how that went."""
-    job = gateway.reload()
-    if not job.done.wait(WORK_LIMIT_S):
-        raise GatewayError("this takes unusually long; see the log")
-    if job.problem:
-        raise GatewayError(job.problem)
-    return "reloaded"
-
-
 @contextlib.contextmanager
-def _signals_heeded(gateway: Gateway) -> Iterator[None]:
+def _signals_heeded(gateway: Gateway, reload: Callable[[], object]) -> Iterator[None]:
     """Do meanwhile what signals ask for; those that come later are for the program that takes this one's place."""
     acts: dict[int, Callable[[], object]] = {
         signal.SIGTERM: gateway.stop,
         signal.SIGINT: gateway.stop,
-        signal.SIGHUP: gateway.reload,
+        signal.SIGHUP: reload,
     }
     is_over = threading.Event()
 

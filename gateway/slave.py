@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable
 from typing import Never
 
-from gateway.backoff import Backoff
 from gateway.clock import Clock
 from gateway.config import SlaveConfig
 from gateway.counters import ServeCounters
@@ -22,6 +21,7 @@ from gateway.link import Link, Waker, silence_s
 from gateway.modbus.framing import Frame, request_framer
 from gateway.modbus.pdu import BROADCAST
 from gateway.modbus.server import answer
+from gateway.opening import Opening, Start, at_once
 from gateway.register import DataRegister
 from gateway.serving import STATION_ALONE, Station, count_traffic, frames_in, server_of
 from gateway.traffic import Tap
@@ -41,8 +41,9 @@ class SerialSlave:
         open_link: Callable[[], Link],
         wait_limit_s: float = 3.0,
         station: Station = STATION_ALONE,
+        start: Start = at_once,
     ) -> None:
-        """*open_link* opens the port or raises LinkError."""
+        """*open_link* opens the port or raises LinkError; *start* has that done, here or in another thread."""
         self.name = config.name
         self.config = config
         self.enabled = config.enabled
@@ -51,11 +52,10 @@ class SerialSlave:
         self.traffic = Tap(config.framing_used, clock, config.character_timeout_used, config.unit)
         self._clock = clock
         self._waker = waker
-        self._open_link = open_link
         self._wait_limit_s = wait_limit_s
         self._framer = request_framer(config.framing_used)
         self._link: Link | None = None
-        self._opening = Backoff(config.name, clock)
+        self._opening = Opening(config.name, clock, open_link, waker, start)
         self._silence_s = 0.0
         self._heard_s = 0.0
         self._is_talk = False  # bytes came that silence has not ended yet
@@ -85,38 +85,38 @@ class SerialSlave:
         self.wake()
 
     def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
-        """Answer until *stop*; *alive* is called after each wait."""
+        """Answer until *stop*; *alive* is called whenever something has been got on with."""
         try:
             while not stop.is_set():
-                alive()
-                self.step()
+                if self.step():
+                    alive()
         finally:
             self._let_go()
+            self._opening.close()
 
-    def step(self) -> None:
-        """Wait for bytes or for the end of a silence, and do what follows."""
+    def step(self) -> bool:
+        """Wait for bytes or for the end of a silence, and do what follows; False if there was nothing to do."""
         if not self.enabled:
             self.ready.set()
             self._let_go()
             self._waker.wait(self._wait_limit_s)
-        elif self._link is None:
+            return True
+        if self._link is None:
             self._open()
-        else:
-            try:
-                self._listen(self._link)
-            except LinkError as error:
-                self._let_go()
-                self._opening.failed(str(error))
-            else:
-                if self._opening.trouble:
-                    self._opening.worked()  # a port that opens has to be read from once before it counts
+            return True
+        try:
+            return self._listen(self._link)
+        except LinkError as error:
+            self._let_go()
+            self._opening.failed(str(error))
+            return True
 
     def _open(self) -> None:
         wait_s = self._opening.wait_s()
         if wait_s:
             self._waker.wait(min(wait_s, self._wait_limit_s))
             return
-        self._link = self._opening.attempt(self._open_link, self.ready)
+        self._link = self._opening.attempt(self.ready)
         if self._link is None:
             return
         self._silence_s = silence_s(self.config.baudrate, self._link.character_s)
@@ -129,9 +129,13 @@ class SerialSlave:
             self.traffic.ended()
         self._link, self._is_talk = None, False
 
-    def _listen(self, link: Link) -> None:
+    def _listen(self, link: Link) -> bool:
+        """Return whether something came, or the wait had a length."""
         now_s = self._clock.monotonic()
-        data = self._read(link, max(0.0, self._due_s(now_s) - now_s))
+        wait_s = max(0.0, self._due_s(now_s) - now_s)
+        data = self._read(link, wait_s)
+        if self._opening.trouble:
+            self._opening.worked()  # a port that opens has to be read from once before it counts
         now_s = self._clock.monotonic()
         if data:
             self._heard_s, self._is_talk = now_s, True
@@ -145,6 +149,7 @@ class SerialSlave:
         if self._framer.pending and now_s >= self._heard_s + self.config.character_timeout_used:
             self._framer.reset()
         self.counters.damaged = self._framer.damaged
+        return bool(data) or wait_s > 0.0
 
     def _read(self, link: Link, timeout_s: float) -> bytes:
         data = link.read(timeout_s)

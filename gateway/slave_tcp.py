@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.backoff import Backoff
 from gateway.clock import Clock
 from gateway.config import SlaveConfig
 from gateway.counters import ServeCounters
@@ -25,6 +24,7 @@ from gateway.link_tcp import is_allowed, set_tcp_options
 from gateway.modbus.framing import Frame, Framer, request_framer
 from gateway.modbus.pdu import BROADCAST, ExceptionCode, exception_reply
 from gateway.modbus.server import Server, answer
+from gateway.opening import Opening, Start, at_once
 from gateway.register import DataRegister, Source, SourceKind
 from gateway.serving import STATION_ALONE, Station, count_traffic, frames_in, server_of
 from gateway.traffic import Tap
@@ -68,8 +68,9 @@ class TcpSlave:
         listen: Callable[[], socket.socket],
         wait_limit_s: float = 3.0,
         station: Station = STATION_ALONE,
+        start: Start = at_once,
     ) -> None:
-        """*listen* gives a listening, non-blocking socket or raises LinkError."""
+        """*listen* gives a listening, non-blocking socket or raises LinkError; *start* has that done somewhere."""
         self.name = config.name
         self.config = config
         self.enabled = config.enabled
@@ -81,9 +82,8 @@ class TcpSlave:
         self.port: int | None = None  # that is listened on; None while it is not
         self._clock = clock
         self._waker = waker
-        self._listen = listen
         self._wait_limit_s = wait_limit_s
-        self._opening = Backoff(config.name, clock)
+        self._opening = Opening(config.name, clock, listen, waker, start)
         self._listener: socket.socket | None = None
         self._selector = selectors.DefaultSelector()
         self._selector.register(waker, selectors.EVENT_READ)
@@ -108,37 +108,43 @@ class TcpSlave:
         self.wake()
 
     def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
-        """Answer until *stop*; *alive* is called after each wait."""
+        """Answer until *stop*; *alive* is called whenever something has been got on with."""
         try:
             while not stop.is_set():
-                alive()
-                self.step()
+                if self.step():
+                    alive()
         finally:
             self.close()
 
     def close(self) -> None:
         """Let go of every client and of the port."""
         self._let_go()
+        self._opening.close()
         self._selector.close()
 
-    def step(self) -> None:
-        """Wait for something to happen, and do what follows."""
+    def step(self) -> bool:
+        """Wait for something to happen, and do what follows; False if nothing came of it."""
         if not self.enabled:
             self.ready.set()
             self._let_go()
         elif self._listener is None and not self._opening.wait_s():
             self._open()
-        for key, events in self._selector.select(self._wait_s()):
+        wait_s = self._wait_s()
+        found = self._selector.select(wait_s)
+        has_got_on = not found and wait_s > 0.0
+        for key, events in found:
             if key.fileobj is self._waker:
                 self._waker.clear()
+                has_got_on = True
             elif key.fileobj is self._listener:
-                self._accept()
+                has_got_on |= self._accept()
             elif key.fd in self.clients:
-                self._serve(self.clients[key.fd], events)
+                has_got_on |= self._serve(self.clients[key.fd], events)
         self._close_idle()
+        return has_got_on
 
     def _open(self) -> None:
-        self._listener = self._opening.attempt(self._listen, self.ready)
+        self._listener = self._opening.attempt(self.ready)
         if self._listener is None:
             return
         self._opening.worked()
@@ -185,24 +191,28 @@ class TcpSlave:
 
     # -------------------------------------------------------------------------------------------- clients
 
-    def _accept(self) -> None:
+    def _accept(self) -> bool:
+        """Let a newcomer in, or not; False if there is none."""
         assert self._listener is not None  # noqa: S101 - only a registered listener is selected
         try:
             connection, address = self._listener.accept()
-        except (BlockingIOError, ConnectionError):  # gone again
-            return
+        except BlockingIOError:
+            return False
+        except ConnectionError:  # gone again
+            return True
         except OSError as error:
             self._make_room(error)
-            return
+            return True
         host, port = address[0], address[1]
         if not is_allowed(host, self.config.allow):
             self.refused_clients += 1
             log.warning("%s: %s is not in the allowed networks", self.name, host)
             connection.close()
-            return
+            return True
         if len(self.clients) >= self.config.max_clients:
             self._close(min(self.clients.values(), key=lambda c: c.active_s), "there are too many clients")
         self._welcome(connection, f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
+        return True
 
     def _make_room(self, error: OSError) -> None:
         """No descriptor is left for a client: let the longest idle go, or wait a little."""
@@ -231,26 +241,29 @@ class TcpSlave:
         client.connection.close()
         self.traffic.ended(client.name)
 
-    def _serve(self, client: Client, events: int) -> None:
+    def _serve(self, client: Client, events: int) -> bool:
+        """Answer what came, send what goes; False if neither came to anything."""
         try:
-            if events & selectors.EVENT_READ and not self._receive(client):
+            received = self._receive(client) if events & selectors.EVENT_READ else 0
+            if received is None:
                 self._close(client, "by the client")
-                return
-            self._send(client)
+                return True
+            sent = self._send(client)
         except OSError as error:
             self._close(client, error.strerror or str(error))
-            return
+            return True
         if client.framer.broken:
             self._close(client, "what it sends is not Modbus TCP")
+        return received + sent > 0
 
-    def _receive(self, client: Client) -> bool:
-        """Take what the client sent and answer it; False when it has closed."""
+    def _receive(self, client: Client) -> int | None:
+        """Take what the client sent and answer it; return how many bytes, None when it has closed."""
         try:
             data = client.connection.recv(RECEIVE_MAX)
         except BlockingIOError:
-            return True
+            return 0
         if not data:
-            return False
+            return None
         client.active_s = self._clock.monotonic()
         self.traffic.tell(False, data, client.name)
         client.framer.receive_data(data)
@@ -262,7 +275,7 @@ class TcpSlave:
             if reply:
                 client.unsent += client.framer.encode(Frame(frame.unit, reply, frame.transaction))
         self._count_damage(client)
-        return True
+        return len(data)
 
     def _reply(self, client: Client, frame: Frame) -> bytes:
         """Return the PDU that answers *frame*; b"" where nothing is answered."""
@@ -300,8 +313,9 @@ class TcpSlave:
             counters.good += 1
         return reply
 
-    def _send(self, client: Client) -> None:
-        """Send what the client takes; while it takes too little it is not listened to."""
+    def _send(self, client: Client) -> int:
+        """Send what the client takes, return how much; while it takes too little it is not listened to."""
+        sent = 0
         if client.unsent:
             with contextlib.suppress(BlockingIOError):
                 sent = client.connection.send(client.unsent)
@@ -313,3 +327,4 @@ class TcpSlave:
         if wanted != client.listening_to:
             client.listening_to = wanted
             self._selector.modify(client.connection, wanted)
+        return sent

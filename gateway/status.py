@@ -35,16 +35,35 @@ def status(station: Station, argument: str = "") -> str:
 
 def status_data(station: Station) -> dict[str, Any]:
     """Return all that is counted; times in seconds, ages null before the first success."""
-    config = station.config
+    config, watchdog = station.config, station.watchdog_state()
     return {
         "version": __version__,
         "uptime_s": round(station.clock.monotonic() - station.started_s, 1),
-        "last_restart": station.last_restart,
+        "last_restart": station.last_restart.words(str),
         "unsaved_changes": station.is_unsaved,
+        "safe_mode": station.is_safe,
+        "watchdog": watchdog.words(str) if watchdog is not None else None,
         "alarms": [alarm.words(str) for alarm in station.alarms()],
         "masters": [_master(station, line, station.master(line.name)) for line in config.master],
         "slaves": [_slave(station, line, station.slave(line.name)) for line in config.slave],
     }
+
+
+def status_line(station: Station) -> str:
+    """Return how the lines fare and what is wrong: one line, the most important first, which may be cut off."""
+    alarms = [alarm.words(str) for alarm in station.alarms()]
+    told = [f"{len(alarms)} alarms: {alarms[0]}" if len(alarms) > 1 else f"alarm: {alarms[0]}"] if alarms else []
+    states = [_in_a_word(line.name, station.master(line.name), "polling") for line in station.config.master]
+    states += [_in_a_word(line.name, station.slave(line.name), "answering") for line in station.config.slave]
+    return "; ".join([*told, ", ".join(states) or "no lines"])
+
+
+def _in_a_word(name: str, view: MasterView | SlaveView | None, working: str) -> str:
+    if view is None:
+        return f"{name} being started anew"
+    if not view.enabled:
+        return f"{name} in maintenance"
+    return f"{name} {'has no line' if view.trouble else working}"
 
 
 def _master(station: Station, line: MasterConfig, view: MasterView | None) -> dict[str, Any]:

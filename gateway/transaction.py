@@ -179,6 +179,7 @@ class Line:
         self._sent_s = 0.0  # when the last bit of the request has left
         self._heard_s = 0.0  # when the last byte came
         self._until_s = late_until_s  # how long TURNAROUND or SPOILED last
+        self.over_by_s = 0.0  # when the request is over at the latest, monotonic, whatever the other side does
 
     # -------------------------------------------------------------------------------------------- for programs
 
@@ -232,6 +233,7 @@ class Line:
             return False
         check_asked(unit, request, has_broadcast=not self._has_transactions)
         self._asked = _Asked(unit, request, timeout_s or self._timing.response_timeout_s)
+        self.over_by_s = self._latest_s(self._asked.timeout_s)
         if self.state is State.IDLE:
             self._hold_back()
         return True
@@ -300,6 +302,12 @@ class Line:
     def _has_begun(self) -> bool:
         """True if something came that is, or was to be, part of a reply; on Modbus TCP the right one may still come."""
         return self._framer.pending > 0 or (self._framer.damaged > 0 and not self._has_transactions)
+
+    def _latest_s(self, timeout_s: float) -> float:
+        """When a request that is asked now is over: behind late replies, the wait for silence, and its own time."""
+        timing = self._timing
+        began_s = max(self._clock.monotonic(), self.late_until_s) + timeout_s + timing.delay_s + timing.silence_s
+        return began_s + timeout_s + timing.turnaround_s + timing.character_timeout_s + 2 * RTU_MAX * timing.character_s
 
     def _silent_s(self) -> float:
         return self._quiet_since_s + self._timing.silence_s + self._timing.delay_s

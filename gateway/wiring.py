@@ -23,6 +23,7 @@ from gateway.link_tcp import connect_tcp, listen_tcp
 from gateway.master import Master
 from gateway.modbus.identification import Identity
 from gateway.modbus.pdu import Span, Table
+from gateway.opening import in_thread
 from gateway.polls import STATUS_COUNT
 from gateway.register import DataRegister
 from gateway.retained import TASK_NAME, Points, RetainedFile, Retainer
@@ -96,7 +97,9 @@ class Station:
 
         def make(waker: Waker) -> Master:
             opener = _opener(line, waker, self.clock)
-            self.masters[line.name] = Master(line, self.register, self.clock, waker, opener, wait_limit_s, self._late_s)
+            self.masters[line.name] = Master(
+                line, self.register, self.clock, waker, opener, wait_limit_s, self._late_s, in_thread
+            )
             return self.masters[line.name]
 
         return _plan(config, line, make)
@@ -111,7 +114,7 @@ class Station:
         )
 
         def make(waker: Waker) -> SerialSlave | TcpSlave:
-            shared = (wait_limit_s, beside)
+            shared = (wait_limit_s, beside, in_thread)
             if line.is_tcp:
                 host, port = line.address
                 listen = partial(listen_tcp, host, port, waker)
@@ -135,7 +138,7 @@ def terminal_plans(config: Config, shared: Shared, control: Plan | None) -> list
     def make_console(waker: Waker) -> SerialConsole:
         settings = SerialSettings(hmi.serial.line, hmi.serial.baudrate, parity="none", mark_errors=True)
         opener = partial(open_serial, settings, waker, shared.clock)
-        return SerialConsole(shared, shared.clock, waker, opener, wait_limit_s)
+        return SerialConsole(shared, shared.clock, waker, opener, wait_limit_s, in_thread)
 
     if hmi.serial.line:
         plans.append(Plan(SERIAL_CONSOLE, make_console, (hmi.serial.line, hmi.serial.baudrate, wait_limit_s)))
@@ -144,7 +147,7 @@ def terminal_plans(config: Config, shared: Shared, control: Plan | None) -> list
 
         def make_telnet(waker: Waker) -> Terminals:
             listen = partial(listen_tcp, host, port, waker)
-            return Terminals(TELNET, shared.clock, waker, listen, TelnetDoor(shared), wait_limit_s)
+            return Terminals(TELNET, shared.clock, waker, listen, TelnetDoor(shared), wait_limit_s, in_thread)
 
         plans.append(Plan(TELNET, make_telnet, (host, port, wait_limit_s)))
     return plans

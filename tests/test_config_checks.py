@@ -331,7 +331,6 @@ def test_polls_that_do_not_fit_their_line_are_a_warning() -> None:
     [
         ({"io": [IO]}, ("io", 0)),
         ({"hmi": {"wifly": {"line": "/dev/ttyS0"}}}, ("hmi", "wifly")),
-        ({"watchdog": {"device": "/dev/watchdog"}}, ("watchdog", "device")),
     ],
 )
 def test_what_is_accepted_and_not_carried_out_is_named(data: dict[str, Any], path: tuple[str | int, ...]) -> None:

@@ -261,13 +261,13 @@ def slow_resolver(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_a_slow_resolver_is_given_up_in_time(slow_resolver: None, waker: Waker) -> None:
     with pytest.raises(LinkUnavailable, match=r"^tcp plc\.example:502: no name server answers within 0\.05 s$"):
-        ports.connect_tcp("plc.example", 502, waker, CLOCK, 0.05)
+        ports.connect_tcp("plc.example", 502, waker, CLOCK, PATIENCE_S, name_limit_s=0.05)
 
 
 def test_a_wake_does_not_end_waiting_for_a_slow_resolver(slow_resolver: None, waker: Waker) -> None:
     waker.wake()
     with pytest.raises(LinkUnavailable, match="no name server answers"):
-        ports.connect_tcp("plc.example", 502, waker, CLOCK, 0.05)
+        ports.connect_tcp("plc.example", 502, waker, CLOCK, PATIENCE_S, name_limit_s=0.05)
 
 
 def test_the_wakers_end_ends_waiting_for_a_slow_resolver(slow_resolver: None, waker: Waker) -> None:

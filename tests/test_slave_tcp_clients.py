@@ -261,7 +261,7 @@ def test_a_port_in_use_is_told_once_and_served_when_it_is_free(caplog: pytest.Lo
             with slave.client() as client:
                 assert client.ask(READ, len(FOUND)) == FOUND
             assert slave.task.trouble == ""
-    told = [record.getMessage() for record in caplog.records if record.name == "gateway.backoff"]
+    told = [record.getMessage() for record in caplog.records if record.name == "gateway.opening"]
     assert told == [
         f"scada: tcp 127.0.0.1:{port}: address already in use; trying again",
         "scada: the line works again",

@@ -49,6 +49,30 @@ def test_the_object_has_every_line_request_and_counter(station: DeskStation) -> 
     assert told["alarms"] == []
 
 
+def test_without_safe_mode_and_a_watchdog_the_object_says_so(station: DeskStation) -> None:
+    told = status_data(station)
+    assert (told["safe_mode"], told["watchdog"], told["last_restart"]) == (False, None, "clean stop")
+
+
+def test_safe_mode_the_watchdog_and_the_cause_are_told_in_the_text_and_in_the_object(station: DeskStation) -> None:
+    station.enter_safe_mode(1800.0)
+    station.last_restart = Told("hang of {name}", {"name": "field"})
+    station.told_watchdog = Told("{device}: well", {"device": "/dev/watchdog"})
+    told = json.loads(status(station, "--json"))
+    assert (told["safe_mode"], told["watchdog"]) == (True, "/dev/watchdog: well")
+    assert told["last_restart"] == "hang of field"
+    assert told["alarms"] == ["safe mode: 3 bad restarts in a row; all lines are in maintenance"]
+    assert [line["state"] for line in told["masters"] + told["slaves"]] == ["maintenance"] * 4
+    assert all(line["enabled"] for line in told["masters"] + told["slaves"])
+    lines = status(station).splitlines()
+    assert lines[0].endswith("; last restart: hang of field")
+    assert lines[1:4] == [
+        "ALARM: safe mode: 3 bad restarts in a row; all lines are in maintenance",
+        "Safe mode: G ends it; else it ends in 00:30:00, for one more try.",
+        "Hardware watchdog: /dev/watchdog: well",
+    ]
+
+
 def test_a_line_that_is_being_made_anew_says_so(station: DeskStation) -> None:
     station.masters.pop("field").close()
     del station.slaves["scada"]

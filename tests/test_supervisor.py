@@ -10,7 +10,7 @@ import pytest
 
 from gateway.clock import SystemClock
 from gateway.link import Waker
-from gateway.supervisor import LOOK_EVERY_S, Plan, Supervisor
+from gateway.supervisor import TICK_MOST_S, Plan, Supervisor
 from tests.fakes import JumpingClock
 from tests.lines import PATIENCE_S
 from tests.tasks import Crashing, CrashingAtStop, Deaf, RunningSupervisor, Tasks, Working, running
@@ -113,7 +113,7 @@ def test_jobs_are_done_in_the_supervisors_thread_in_the_order_they_came() -> Non
 def test_a_job_does_not_wait_until_the_supervisor_looks_around_by_itself() -> None:
     with running(Supervisor([], SystemClock())) as run:
         for _ in range(3):
-            run.do(lambda: None, LOOK_EVERY_S / 2)
+            run.do(lambda: None, TICK_MOST_S / 2)
 
 
 def test_a_job_submitted_before_the_start_is_done_after_it() -> None:
@@ -168,7 +168,7 @@ def test_a_chore_is_done_in_the_supervisors_thread_and_again_after_the_time_it_s
     supervisor.chores.append(chore)
     with running(supervisor):
         for _ in range(5):
-            assert often.acquire(timeout=LOOK_EVERY_S / 2), "it is not done again"
+            assert often.acquire(timeout=TICK_MOST_S / 2), "it is not done again"
     assert set(seen) == {"supervisor"}
 
 

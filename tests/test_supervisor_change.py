@@ -96,7 +96,7 @@ def test_a_task_made_anew_starts_as_its_plan_says_it_is_switched() -> None:
         assert not task(run, "a").enabled
         run.change([tasks.plan("a", basis=1)])
         assert task(run, "a").enabled
-        assert tasks.told == ["a made", "a stopped", "a made", "a on"]
+        assert tasks.told == ["a made", "a stopped", "a made", "a off", "a on"]
 
 
 def test_a_stop_during_a_change_stops_the_new_tasks_too() -> None:

@@ -17,6 +17,7 @@ from tests.configs import MASTER, REQUEST, SLAVE
 from tests.hmi.terminals import MAIN_MENU, House, tcp_client, unix_client
 from tests.lines import PATIENCE_S, Pty, pty_pair
 from tests.peers import free_port
+from tests.programs import until
 from tests.tasks import RunningSupervisor, running
 
 CLOCK = SystemClock()
@@ -167,7 +168,7 @@ def test_telnet_moves_to_another_port_and_whoever_is_there_is_let_go() -> None:
 
 def wait_for_port(run: RunningSupervisor) -> int:
     telnet: Any = run.supervisor.tasks[TELNET]
-    assert telnet.ready.wait(PATIENCE_S)
+    until(lambda: telnet.port is not None)
     assert isinstance(telnet.port, int)
     return telnet.port
 

@@ -15,12 +15,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from gateway.backoff import Backoff
 from gateway.clock import Clock
 from gateway.errors import LinkError
 from gateway.hmi.seat import Rank
 from gateway.hmi.session import Session, Shared
 from gateway.link import Link, Waker
+from gateway.opening import Opening, Start, at_once
 
 WRITE_S: Final = 0.1  # so much is written at once, as time on the wire: then it is listened again
 WRITE_MOST: Final = 1024  # bytes; a pty says that its characters take no time
@@ -93,17 +93,22 @@ class SerialConsole:
     """The menu's serial console; a ``Task``."""
 
     def __init__(
-        self, shared: Shared, clock: Clock, waker: Waker, open_link: Callable[[], Link], wait_limit_s: float = 3.0
+        self,
+        shared: Shared,
+        clock: Clock,
+        waker: Waker,
+        open_link: Callable[[], Link],
+        wait_limit_s: float = 3.0,
+        start: Start = at_once,
     ) -> None:
-        """*open_link* opens the port, errors marked, or raises LinkError."""
+        """*open_link* opens the port, errors marked, or raises LinkError; *start* has that done somewhere."""
         self.name = "serial console"
         self.ready = threading.Event()
         self._shared = shared
         self._clock = clock
         self._waker = waker
-        self._open_link = open_link
         self._wait_limit_s = wait_limit_s
-        self._opening = Backoff(self.name, clock)
+        self._opening = Opening(self.name, clock, open_link, waker, start)
         self._noise = Noise(clock)
         self._link: Link | None = None
         self._bytes = MarkedBytes()
@@ -122,35 +127,34 @@ class SerialConsole:
         """The menu is never in maintenance."""
 
     def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
-        """Carry bytes until *stop*; *alive* is called after each wait."""
+        """Carry bytes until *stop*; *alive* is called whenever something has been got on with."""
         try:
             while not stop.is_set():
-                alive()
-                self.step()
+                if self.step():
+                    alive()
         finally:
             self._let_go()
+            self._opening.close()
 
-    def step(self) -> None:
-        """Wait for keys or for what is due, and do what follows."""
+    def step(self) -> bool:
+        """Wait for keys or for what is due, and do what follows; False if nothing came of it."""
         self._noise.count(0)
         if self._link is None or self._session is None:
             self._open()
-            return
+            return True
         try:
-            self._carry(self._link, self._session)
+            return self._carry(self._link, self._session)
         except LinkError as error:
             self._let_go()
             self._opening.failed(str(error))
-        else:
-            if self._opening.trouble:
-                self._opening.worked()  # a port that opens has to be read from once before it counts
+            return True
 
     def _open(self) -> None:
         wait_s = self._opening.wait_s()
         if wait_s:
             self._waker.wait(min(wait_s, self._wait_limit_s))
             return
-        self._link = self._opening.attempt(self._open_link, self.ready)
+        self._link = self._opening.attempt(self.ready)
         if self._link is None:
             return
         self._bytes = MarkedBytes()
@@ -166,8 +170,13 @@ class SerialConsole:
         if session is not None:
             session.hang_up()
 
-    def _carry(self, link: Link, session: Session) -> None:
-        typed = self._bytes.receive(link.read(self._wait_s(session)))
+    def _carry(self, link: Link, session: Session) -> bool:
+        """Return whether bytes went either way, or the wait had a length."""
+        wait_s = self._wait_s(session)
+        data = link.read(wait_s)
+        if self._opening.trouble:
+            self._opening.worked()  # a port that opens has to be read from once before it counts
+        typed = self._bytes.receive(data)
         if self._bytes.faults:
             self._noise.count(self._bytes.faults)
             self._bytes.faults = 0
@@ -177,6 +186,7 @@ class SerialConsole:
         if part:
             link.write(part)
             session.sent(len(part))
+        return bool(data or part) or wait_s > 0.0
 
     def _wait_s(self, session: Session) -> float:
         """How long nothing is to be done but listen; 0 while something waits to be written."""

@@ -133,7 +133,7 @@ class Station(Protocol):
     clock: Clock
     register: DataRegister
     started_s: float  # monotonic
-    last_restart: str  # why it was started last, in words
+    last_restart: Told  # why it was started last
 
     @property
     def config(self) -> Config:
@@ -155,6 +155,24 @@ class Station(Protocol):
 
     def alarms(self) -> list[Told]:
         """Return what a person should know of, worst first."""
+        ...
+
+    @property
+    def is_safe(self) -> bool:
+        """Whether it runs in safe mode: after three bad restarts in a row, all lines in maintenance (section 7)."""
+        ...
+
+    @property
+    def safe_left_s(self) -> float | None:
+        """How long until safe mode ends by itself, for one more try; None: there is no safe mode."""
+        ...
+
+    def end_safe_mode(self, told: Callable[[], None]) -> Job:
+        """Have all lines run as configured again; does nothing where there is no safe mode."""
+        ...
+
+    def watchdog_state(self) -> Told | None:
+        """Return how the hardware watchdog fares; None where none is configured."""
         ...
 
     def notices(self, after: int) -> tuple[int, list[Told]]:

@@ -19,13 +19,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
 
-from gateway.backoff import Backoff
 from gateway.clock import Clock
 from gateway.hmi.seat import Rank
 from gateway.hmi.session import Session, Shared
 from gateway.hmi.telnet import TelnetFilter
 from gateway.link import Waker
 from gateway.link_tcp import is_allowed, set_tcp_options
+from gateway.opening import Opening, Start, at_once
 
 RECEIVE_MAX: Final = 1024  # bytes taken from a terminal at once
 READ_PAUSE_S: Final = 0.02  # so long no more is taken from it: faster than any person, and Modbus keeps the processor
@@ -144,18 +144,21 @@ class Terminals:
         listen: Callable[[], socket.socket],
         welcome: Welcome,
         wait_limit_s: float = 3.0,
+        start: Start = at_once,
     ) -> None:
-        """*listen* gives a listening, non-blocking socket or raises LinkError; *welcome* says who a newcomer is."""
+        """*listen* gives a listening, non-blocking socket or raises LinkError; *start* has that done somewhere.
+
+        welcome: says who a newcomer is.
+        """
         self.name = name
         self.ready = threading.Event()
         self.connections: dict[int, Connection] = {}
         self.port: int | None = None  # TCP: that is listened on; None while it is not
         self._clock = clock
         self._waker = waker
-        self._listen = listen
         self._welcome = welcome
         self._wait_limit_s = wait_limit_s
-        self._opening = Backoff(name, clock)
+        self._opening = Opening(name, clock, listen, waker, start)
         self._listener: socket.socket | None = None
         self._accepts_again_s: float | None = None  # set while newcomers have to wait
         self._newcomers_s: deque[float] = deque(maxlen=NEWCOMERS_MOST)  # when they came
@@ -175,29 +178,35 @@ class Terminals:
         """The menu is never in maintenance."""
 
     def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
-        """Carry bytes until *stop*; *alive* is called after each wait."""
+        """Carry bytes until *stop*; *alive* is called whenever something has been got on with."""
         try:
             while not stop.is_set():
-                alive()
-                self.step()
+                if self.step():
+                    alive()
         finally:
             self.close()
 
-    def step(self) -> None:
-        """Wait for something to happen, and do what follows."""
+    def step(self) -> bool:
+        """Wait for something to happen, and do what follows; False if nothing came of it."""
         self._open_if_due()
-        for key, events in self._selector.select(self._wait_s()):
+        wait_s = self._wait_s()
+        found = self._selector.select(wait_s)
+        has_got_on = not found and wait_s > 0.0
+        for key, events in found:
             if key.fileobj is self._waker:
                 self._waker.clear()
+                has_got_on = True
             elif key.fileobj is self._listener:
-                self._accept()
+                has_got_on |= self._accept()
             elif events & selectors.EVENT_READ and key.fd in self.connections:
-                self._receive(self.connections[key.fd])
+                has_got_on |= self._receive(self.connections[key.fd])
         for connection in list(self.connections.values()):
-            self._attend(connection)
+            has_got_on |= self._attend(connection)
+        return has_got_on
 
     def close(self) -> None:
         """Say goodbye to everybody, and let go of the socket."""
+        self._opening.close()
         for connection in list(self.connections.values()):
             connection.conversation.stop()
             with contextlib.suppress(OSError):
@@ -216,38 +225,44 @@ class Terminals:
     def _open_if_due(self) -> None:
         now_s = self._clock.monotonic()
         if self._listener is None and not self._opening.wait_s():
-            self._opening.attempt(self._start_listening, self.ready)
+            self._start_listening(self._opening.attempt(self.ready))
         elif self._listener is not None and self._accepts_again_s is not None and now_s >= self._accepts_again_s:
             self._accepts_again_s = None
             self._selector.register(self._listener, selectors.EVENT_READ)
 
-    def _start_listening(self) -> None:
-        listener = self._listener = self._listen()
+    def _start_listening(self, listener: socket.socket | None) -> None:
+        if listener is None:
+            return
+        self._listener = listener
         self._opening.worked()
         self._selector.register(listener, selectors.EVENT_READ)
         name = listener.getsockname()
         self.port = None if isinstance(name, str) else name[1]
         log.info("%s: listening on %s", self.name, name if isinstance(name, str) else f"port {self.port}")
 
-    def _accept(self) -> None:
+    def _accept(self) -> bool:
+        """Let a newcomer in, or not; False if there is none."""
         assert self._listener is not None  # noqa: S101 - only a registered listener is selected
         try:
             accepted, _address = self._listener.accept()
-        except (BlockingIOError, ConnectionError):  # gone again
-            return
+        except BlockingIOError:
+            return False
+        except ConnectionError:  # gone again
+            return True
         except OSError as error:
             log.error("%s: a connection could not be accepted: %s", self.name, error.strerror)
             self._accept_again_after(NO_DESCRIPTOR_PAUSE_S)
-            return
+            return True
         self._newcomers_s.append(self._clock.monotonic())
         if self._newcomers_s[-1] - self._newcomers_s[0] < NEWCOMERS_S and len(self._newcomers_s) == NEWCOMERS_MOST:
             self._accept_again_after(NEWCOMERS_S)
         conversation = self._welcomed(accepted) if len(self.connections) < CONNECTIONS_MOST else None
         if conversation is None:
             accepted.close()
-            return
+            return True
         self.connections[accepted.fileno()] = Connection(accepted, conversation)
         self._selector.register(accepted, selectors.EVENT_READ)
+        return True
 
     def _accept_again_after(self, pause_s: float) -> None:
         assert self._listener is not None  # noqa: S101 - only a registered listener is selected
@@ -278,14 +293,15 @@ class Terminals:
                 due_s.append(connection.reads_again_s)
         return max(0.0, min(due_s) - now_s)
 
-    def _receive(self, connection: Connection) -> None:
+    def _receive(self, connection: Connection) -> bool:
+        """Take what came; False if nothing did."""
         try:
             data = connection.socket.recv(RECEIVE_MAX)
         except BlockingIOError:
-            return
+            return False
         except OSError:
             self._close(connection)
-            return
+            return True
         connection.reads_again_s = self._clock.monotonic() + READ_PAUSE_S
         if data:
             connection.conversation.receive(data)
@@ -294,26 +310,29 @@ class Terminals:
         else:
             connection.has_ended_input = True
             connection.conversation.end_input()
+        return True
 
-    def _attend(self, connection: Connection) -> None:
-        """Do what is due, send what can be sent, and close what is over."""
+    def _attend(self, connection: Connection) -> bool:
+        """Do what is due, send what can be sent, and close what is over; False if nothing was sent or closed."""
         connection.conversation.turn()
         now_s = self._clock.monotonic()
         is_over = connection.conversation.is_over
         if is_over and connection.closes_at_s is None:
             connection.closes_at_s = now_s + LINGER_S
         try:
-            if self._send(connection) and is_over:
+            sent = self._send(connection)
+            if sent and is_over:
                 connection.closes_at_s = now_s + LINGER_S
             if is_over and not connection.conversation.output:
                 connection.socket.shutdown(socket.SHUT_WR)
         except OSError:
             self._close(connection)
-            return
+            return True
         if connection.closes_at_s is not None and now_s >= connection.closes_at_s:
             self._close(connection)
-        else:
-            self._select(connection)
+            return True
+        self._select(connection)
+        return sent > 0
 
     def _send(self, connection: Connection) -> int:
         """Send what the other side takes now; return how many bytes."""

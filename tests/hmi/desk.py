@@ -30,6 +30,7 @@ from tests.fakes import FakeField, JumpingClock, JumpingWaker, LosableLink
 STATIONS = Path(__file__).parent / "stations"
 PROMPTS = ("rtugate> ", "rtugate*> ")  # of the main menu
 STEPS_MOST = 20_000
+SAFE_MODE = "safe mode: {count} bad restarts in a row; all lines are in maintenance"  # as the gateway words it
 STALE = "the configuration was changed from elsewhere meanwhile"
 
 
@@ -67,7 +68,9 @@ class DeskStation:
         self.time = JumpingClock()
         self.clock: Clock = self.time  # the same, as the screens see it
         self.started_s = self.clock.monotonic() - 3700.0
-        self.last_restart = "clean stop"
+        self.last_restart = Told("clean stop")
+        self.safe_until_s: float | None = None
+        self.told_watchdog: Told | None = None
         self.config: Config = load_text(text, "rtugate.toml").config
         self.saved: Config | None = self.config
         self.before: Config | None = None  # the last save
@@ -103,6 +106,21 @@ class DeskStation:
 
     def alarms(self) -> list[Told]:
         return self.told_alarms
+
+    @property
+    def is_safe(self) -> bool:
+        return self.safe_until_s is not None
+
+    @property
+    def safe_left_s(self) -> float | None:
+        return None if self.safe_until_s is None else self.safe_until_s - self.clock.monotonic()
+
+    def end_safe_mode(self, told: Callable[[], None]) -> Job:
+        self.leave_safe_mode()
+        return self._done(told)
+
+    def watchdog_state(self) -> Told | None:
+        return self.told_watchdog
 
     def notices(self, after: int) -> tuple[int, list[Told]]:
         return len(self.told_notices), self.told_notices[after:]
@@ -173,6 +191,18 @@ class DeskStation:
         while self.clock.monotonic() < end_s:
             self.step()
 
+    def enter_safe_mode(self, left_s: float) -> None:
+        """Be as after three bad restarts; it ends by itself in *left_s* seconds."""
+        self.safe_until_s = self.clock.monotonic() + left_s
+        self.told_alarms.insert(0, Told(SAFE_MODE, {"count": 3}))
+        self._switch_lines()
+
+    def leave_safe_mode(self) -> None:
+        """Have all lines run as configured."""
+        self.safe_until_s = None
+        self.told_alarms = [alarm for alarm in self.told_alarms if alarm.text != SAFE_MODE]
+        self._switch_lines()
+
     def finish_work(self, problem: str = "") -> None:
         """Be done with what took long; *problem*: it has failed."""
         for job, told in self._unfinished:
@@ -218,6 +248,16 @@ class DeskStation:
             if kept is None or kept.config != slave:
                 kept = ASlave(slave.name, slave.enabled, slave, self._a_tap(slave))
             self.slaves[slave.name] = kept
+        self._switch_lines()
+
+    def _switch_lines(self) -> None:
+        """Have each line work that is on, outside safe mode."""
+        for line in self.config.master:
+            works = line.enabled and not self.is_safe
+            if self.masters[line.name].enabled != works:
+                self.masters[line.name].set_enabled(works)
+        for slave in self.config.slave:
+            self.slaves[slave.name].enabled = slave.enabled and not self.is_safe
 
     def _a_tap(self, slave: SlaveConfig) -> Tap:
         return Tap(slave.framing_used, self.clock, slave.character_timeout_used, slave.unit)

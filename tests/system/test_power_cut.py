@@ -174,7 +174,7 @@ def check_what_is_left(action: str, folder: Path, ended: Run) -> None:
 
 def check_cause(state: Path, ended: Run) -> None:
     """The next run knows how the one before it ended; where that could not be kept, it was said."""
-    cause = LastRun(state).begin()
+    cause = LastRun(state).begin().cause.text
     assert cause in NEXT_CAUSE[ended.last] or "cannot be kept" in "".join(ended.lines), (cause, ended)
     assert cause in {FIRST, CRASH, CLEAN}
     (state / FILE).unlink()

@@ -15,7 +15,7 @@ from gateway.config_checks import cross_check
 from gateway.config_fields import explain
 from gateway.errors import ConfigError
 from gateway.hmi.menu import Back, Dialogue, Ui
-from gateway.hmi.station import Station
+from gateway.hmi.station import Job, Station
 
 LONGEST_CHANGE_S: Final = 60.0  # to stop and start tasks; opening a port has its own limit
 READS_ONLY: Final = ("on_failure", "stale_after", "events")
@@ -91,27 +91,26 @@ def _warnings(old: Config, new: Config) -> list[str]:
 
 
 def put_to_work(ui: Ui, station: Station, old: Config, new: Config, told: str = "") -> Dialogue[bool]:
-    """Have *new* run instead of *old* and say so; False, with every reason, where it cannot.
-
-    Esc ends the waiting, not the work.
-    """
+    """Have *new* run instead of *old* and say so; False, with every reason, where it cannot."""
     _ = ui.translate
     try:
         job = station.change(old, new, ui.wake)
     except ConfigError as error:
         ui.say(*(_(str(getattr(finding, "message", finding))) for finding in error.findings))
         return False
+    if not (yield from carried_out(ui, job, told)):
+        return False
+    ui.say(*(_("Warning: {text}").format(text=text) for text in _warnings(old, new)))
+    return True
+
+
+def carried_out(ui: Ui, job: Job, told: str) -> Dialogue[bool]:
+    """Wait for *job*; say *told*, or what is wrong; False where it has failed. Esc ends the waiting, not the work."""
+    _ = ui.translate
     try:
         is_done = yield from ui.wait_for(lambda: job.is_done, LONGEST_CHANGE_S)
     except Back:
         ui.say(_("It goes on by itself; I shows the station."))
         return True
-    if not is_done:
-        ui.say(_("This takes unusually long; see I."))
-    elif job.problem:
-        ui.say(_(job.problem))
-        return False
-    elif told:
-        ui.say(told)
-    ui.say(*(_("Warning: {text}").format(text=text) for text in _warnings(old, new)))
-    return True
+    ui.say(*filter(None, [_(job.problem) or (told if is_done else _("This takes unusually long; see I."))]))
+    return not job.problem

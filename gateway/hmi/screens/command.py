@@ -58,7 +58,11 @@ def _ask_master(ui: Ui, station: Station) -> Dialogue[MasterView | None]:
     if master is None:
         ui.say(_("{name} is being started anew: try again in a moment.").format(name=name))
     elif not master.enabled:
-        ui.say(_("{name} is in maintenance: A switches it on.").format(name=name))
+        safe, off = (
+            _("{name} is in maintenance: safe mode; G ends it."),
+            _("{name} is in maintenance: A switches it on."),
+        )
+        ui.say((safe if station.is_safe else off).format(name=name))
         return None
     elif master.trouble:
         ui.say(_("The line of {name} cannot be used: {reason}").format(name=name, reason=master.trouble))

@@ -12,8 +12,15 @@ from gateway.hmi.screens.data import change_data, show_data
 from gateway.hmi.screens.file import factory_settings, restart, save, set_password, undo
 from gateway.hmi.screens.lines import lines
 from gateway.hmi.screens.requests import requests
-from gateway.hmi.screens.settings import master_on_off, master_speed, slave_on_off, slave_speed, slave_unit
-from gateway.hmi.screens.status import show_log, show_status, show_traffic
+from gateway.hmi.screens.settings import (
+    end_safe_mode,
+    master_on_off,
+    master_speed,
+    slave_on_off,
+    slave_speed,
+    slave_unit,
+)
+from gateway.hmi.screens.status import safe_mode_rows, show_log, show_status, show_traffic
 from gateway.hmi.screens.writes import WriteDisplay
 from gateway.hmi.station import Station
 from gateway.hmi.wording import duration_text
@@ -40,6 +47,7 @@ DIALOGUES: Final[dict[str, Callable[[Ui, Station], Dialogue[None]]]] = {
     "p": set_password,
     "f": factory_settings,
     "x": restart,
+    "g": end_safe_mode,  # shown only in safe mode
 }
 KEYS: Final = "".join(DIALOGUES) + "me" + LEAVE
 
@@ -128,6 +136,7 @@ def _show_menu(ui: Ui, station: Station) -> None:
         ui.say(_("ALARM: {alarm}").format(alarm=alarms[0].words(_)))
         if len(alarms) > 1:
             ui.say(_("... and {count} more: I shows them.").format(count=len(alarms) - 1))
+    ui.say(*safe_mode_rows(ui, station))
     if station.confirm_left_s is not None:
         left = duration_text(station.confirm_left_s)
         ui.say(_("The last save is undone in {time} unless W confirms it.").format(time=left))

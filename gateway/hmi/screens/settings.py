@@ -1,4 +1,4 @@
-"""Keys V, B, A, S and K: speed, on/off, unit identifier of one line (spec section 5)."""
+"""Keys V, B, A, S and K: speed, on/off, unit identifier of one line; G: safe mode ends (spec sections 5 and 7)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Final
 from gateway.config import Config, LineConfig, SlaveConfig
 from gateway.errors import ConfigError
 from gateway.hmi.menu import Dialogue, Ui
-from gateway.hmi.screens.changes import changed, put_to_work, tell_faults, with_line, with_slave
+from gateway.hmi.screens.changes import carried_out, changed, put_to_work, tell_faults, with_line, with_slave
 from gateway.hmi.station import Station
 
 SPEEDS: Final = {  # 1 to 3 as on the original board
@@ -122,8 +122,17 @@ def _on_off(ui: Ui, station: Station, lines: Sequence[LineConfig], what: str) ->
         new = changed(line, {"enabled": not line.enabled})
     else:
         new = yield from _ask_missing(ui, config, line)
-    told = _("{name} is on.") if new.enabled else _("{name} is off: maintenance.")
-    yield from put_to_work(ui, station, config, with_line(config, line, new), told.format(name=line.name))
+    told = _switched(ui, station, new).format(name=line.name)
+    yield from put_to_work(ui, station, config, with_line(config, line, new), told)
+
+
+def _switched(ui: Ui, station: Station, line: LineConfig) -> str:
+    _ = ui.translate
+    if not line.enabled:
+        return _("{name} is off: maintenance.")
+    if station.is_safe:
+        return _("{name} is on, but stays in maintenance until safe mode ends (G).")
+    return _("{name} is on.")
 
 
 def _ask_missing(ui: Ui, config: Config, line: LineConfig) -> Dialogue[LineConfig]:
@@ -155,6 +164,22 @@ def ask_port(ui: Ui, line: LineConfig) -> Dialogue[str]:
         return text
 
     return (yield from ui.value(_("Port or address"), judge, line.line, limit=LINE_LIMIT))
+
+
+# ------------------------------------------------------------------------------------------------ G
+
+
+def end_safe_mode(ui: Ui, station: Station) -> Dialogue[None]:
+    """Have all lines run as configured again, after bad restarts."""
+    _ = ui.translate
+    ui.help = _("Three bad restarts in a row, each within 10 minutes, start safe mode; I shows the cause of the last.")
+    if not station.is_safe:
+        ui.say(_("The gateway is not in safe mode."))
+        return
+    ui.say(_("All lines will run as configured; three more bad restarts undo this."))
+    if not (yield from ui.confirmed(_("End safe mode?"))):
+        return
+    yield from carried_out(ui, station.end_safe_mode(ui.wake), _("Safe mode is over: all lines run as configured."))
 
 
 # ------------------------------------------------------------------------------------------------ K

@@ -17,6 +17,7 @@ from gateway.polls import Poll
 STATUS_EVERY_S: Final = 2.0
 TRAFFIC_EVERY_S: Final = 0.25
 LINES_AT_ONCE: Final = 20
+LONGEST_CAUSE: Final = 100  # characters of why it was started; where many lines have hung the log names them all
 
 
 # ------------------------------------------------------------------------------------------------ I
@@ -34,21 +35,39 @@ def status_head(ui: Ui, station: Station) -> list[str]:
     """Return what is told first: since when it runs, and why it was started."""
     _ = ui.translate
     uptime = duration_text(ui.clock.monotonic() - station.started_s)
-    text = _("Running for {uptime}; last restart: {cause}").format(uptime=uptime, cause=_(station.last_restart))
-    return [text + (_("; unsaved changes") if station.is_unsaved else "")]
+    cause = cut(station.last_restart.words(_), LONGEST_CAUSE)
+    text = _("Running for {uptime}; last restart: {cause}").format(uptime=uptime, cause=cause)
+    return ui.parts(text + (_("; unsaved changes") if station.is_unsaved else ""))
 
 
 def status_rows(ui: Ui, station: Station) -> list[str]:
-    """Return alarms, lines, requests and clients, a row each."""
+    """Return alarms, safe mode, the hardware watchdog, lines, requests and clients, a row each."""
     _ = ui.translate
     alarms = station.alarms()
     told = [_("ALARM: {alarm}").format(alarm=alarm.words(_)) for alarm in alarms] or [_("No alarms.")]
-    rows = [part for alarm in told for part in ui.parts(alarm)]
+    told += [*safe_mode_rows(ui, station), *_watchdog_rows(ui, station)]
+    rows = [part for row in told for part in ui.parts(row)]
     for line in station.config.master:
         rows += _master_rows(ui, line, station.master(line.name))
     for slave in station.config.slave:
         rows += _slave_rows(ui, slave, station.slave(slave.name))
     return [cut(row, ui.columns - 1) for row in rows]
+
+
+def safe_mode_rows(ui: Ui, station: Station) -> list[str]:
+    """Return how safe mode ends; nothing where there is none."""
+    _ = ui.translate
+    left_s = station.safe_left_s
+    if left_s is None:
+        return []
+    left = duration_text(max(0.0, left_s))  # it is over when the supervisor has seen to it
+    return [_("Safe mode: G ends it; else it ends in {time}, for one more try.").format(time=left)]
+
+
+def _watchdog_rows(ui: Ui, station: Station) -> list[str]:
+    _ = ui.translate
+    state = station.watchdog_state()
+    return [_("Hardware watchdog: {state}").format(state=state.words(_))] if state is not None else []
 
 
 def _title_rows(ui: Ui, line: LineConfig, kind: str, state: str, trouble: str = "") -> list[str]:
@@ -148,6 +167,9 @@ def show_traffic(ui: Ui, station: Station) -> Dialogue[None]:
         return
     if not line.enabled:
         ui.say(_("{name} is in maintenance: A or S switches it on.").format(name=line.name))
+        return
+    if station.is_safe:
+        ui.say(_("{name} is in maintenance: safe mode; G ends it.").format(name=line.name))
         return
     ui.say(_("Traffic of {name}, until any key: > sent, < heard").format(name=line.name))
     is_over = False
