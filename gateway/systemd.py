@@ -115,15 +115,15 @@ class Systemd:
         while self._states and self._sends(self._states[0]):
             self._states.popleft()
         now_s = self._clock.monotonic()
-        is_due = not self._states and now_s >= self._status_due_s
-        if is_due and self._status != self._told_status and self._sends(f"STATUS={self._status}"):
+        is_due = self._status != self._told_status and now_s >= self._status_due_s
+        if is_due and self._sends(f"STATUS={self._status}"):
             self._told_status, self._status_due_s = self._status, now_s + STATUS_PACE_S
 
     def _sends(self, message: str) -> bool:
         """Return whether *message* is sent now."""
         try:
             if not self._socket:
-                self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+                self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.sendto(message.encode(), socket.MSG_DONTWAIT, self._address)
         except OSError as error:
             self._found(plain_reason(error, _REASONS))

@@ -102,8 +102,8 @@ class SystemCalls:
     """The real ones."""
 
     def open(self, path: Path) -> int:
-        """Open; a FIFO without a reader is no wait, and no child inherits it."""
-        return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        """Open; a FIFO without a reader is no wait. No child inherits it, as nothing that Python opens."""
+        return os.open(path, os.O_WRONLY | os.O_NONBLOCK)
 
     def mode(self, fd: int) -> int:
         """By fstat(2)."""

@@ -1,7 +1,4 @@
-"""How much is logged: no flood fills a flash card, and the log's end is true however little of it was told.
-
-Lines that were held back are told with how many they stand for, so that none is ever lost uncounted.
-"""
+"""How much is logged: of each cause no more than is worth its place, and what is newest late rather than never."""
 
 from __future__ import annotations
 
@@ -9,86 +6,16 @@ import gc
 import logging
 import re
 import threading
-import tracemalloc
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import datetime
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from gateway.logs import (
-    AGAIN_S,
-    ALL_BURST,
-    BURST,
-    CAUSES_MOST,
-    LATE_AT_ONCE,
-    LATE_BURST,
-    LATE_PAUSE_S,
-    REST_MOST,
-    SETTLED_S,
-    WORDINGS_MOST,
-    LogRing,
-    RateLimited,
-    SafeFormatter,
-)
-from tests.fakes import SCADA, JumpingClock, MasterBench, reads
-
-
-class Told(logging.Handler):
-    """Every line that gets through; *during* is called while one is written."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.setFormatter(SafeFormatter())
-        self.lines: list[str] = []
-        self.during: Callable[[], object] = bool
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.during()
-        self.lines += self.format(record).split("\n")
-
-
-class Desk:
-    """A logger, its limiter and what gets through, on a clock that jumps."""
-
-    def __init__(self, clock: JumpingClock) -> None:
-        self.clock = clock
-        self.told = Told()
-        self.limited = RateLimited(clock, [self.told])
-        self.log = logging.Logger("test", logging.DEBUG)
-        self.log.addHandler(self.limited)
-
-    @property
-    def lines(self) -> list[str]:
-        return self.told.lines
-
-    def new_lines(self) -> list[str]:
-        lines, self.told.lines = self.told.lines, []
-        return lines
-
-    def pass_s(self, seconds: float) -> None:
-        """Let time pass, and have the main thread look whenever it is due."""
-        until_s = self.clock.monotonic() + seconds
-        while True:
-            wait_s = self.limited.flush_due()
-            assert wait_s > 0
-            left_s = until_s - self.clock.monotonic()
-            if left_s <= 0:
-                return
-            self.clock.pass_s(min(wait_s, left_s))
-
-    def settle(self) -> None:
-        """A day without a line."""
-        self.pass_s(86400.0)
-
-    def spend(self, template: str, *args: object, **about: object) -> None:
-        """Use up the burst of a cause."""
-        for _ in range(BURST):
-            self.log.warning(template, *args, **about)  # type: ignore[arg-type]  # extra= only
-        self.new_lines()
+from gateway.logs import AGAIN_S, ALL_BURST, BURST, REST_MOST, SETTLED_S, LogRing, RateLimited
+from tests.fakes import SCADA, JumpingClock
+from tests.log_desk import Desk, Told, bare, left_out_of
 
 
 @pytest.fixture
@@ -96,18 +23,6 @@ def desk(clock: JumpingClock) -> Iterator[Desk]:
     made = Desk(clock)
     yield made
     made.limited.close()
-
-
-LATE = re.compile(r" \((told late, this was at \d\d-\d\d \d\d:\d\d:\d\d)?(; )?((\d+) more like it w\w+ left out)?\)$")
-
-
-def left_out_of(line: str) -> int:
-    found = LATE.search(line)
-    return int(found[4] or 0) if found else 0
-
-
-def bare(line: str) -> str:
-    return LATE.sub("", line)
 
 
 def test_ten_lines_of_a_cause_are_told_at_once_then_one_in_ten_minutes_with_how_many_were_left_out(desk: Desk) -> None:
@@ -317,138 +232,6 @@ def test_clocks_that_are_set_trip_nothing(desk: Desk, clock: JumpingClock) -> No
         desk.log.warning("up")
         assert desk.limited.flush_due() == SETTLED_S
     assert desk.lines == []
-
-
-# ------------------------------------------------------------------------------------------------ storms
-
-
-@pytest.mark.parametrize(("every_s", "most"), [(60.0, 0), (600.0, CAUSES_MOST)])
-def test_storms_of_many_causes_are_no_more_than_two_lines_a_minute(desk: Desk, every_s: float, most: int) -> None:
-    """*most*: what is told besides at first, where the storms pause for long enough to be over."""
-    hours = 4
-    for _ in range(int(hours * 3600 / every_s)):
-        for number in range(500):
-            desk.log.warning("%s: unit %d is offline", f"line {number // 200}", number)
-        desk.pass_s(every_s)
-    assert hours * 60 < len(desk.lines) <= ALL_BURST + LATE_BURST + most + hours * 120
-
-
-def test_after_a_storm_all_that_waits_is_told_a_few_at_a_time(desk: Desk) -> None:
-    for _ in range(2):
-        for number in range(1000):
-            desk.log.warning("%s: up", f"request {number}")
-    assert len(desk.new_lines()) == ALL_BURST
-    desk.pass_s(SETTLED_S - 1.0)
-    assert desk.lines == []
-    desk.clock.pass_s(1.0)
-    assert desk.limited.flush_due() == LATE_PAUSE_S
-    assert len(desk.lines) == LATE_AT_ONCE
-    desk.pass_s(1000 / LATE_AT_ONCE * LATE_PAUSE_S)
-    assert len(desk.lines) == 1000
-    assert sum(1 + left_out_of(line) for line in desk.lines) == 2000 - ALL_BURST
-
-
-def test_a_master_whose_wire_breaks_and_heals_for_hours_fills_no_flash_card(clock: JumpingClock) -> None:
-    bench = MasterBench(
-        clock,
-        *(reads(1 + number // 5, number, name=f"r{number}", every=10.0) for number in range(200)),
-        response_timeout=0.1,
-        baudrate=115200,
-    )
-    every, desk = Told(), Desk(clock)
-    log = logging.getLogger("gateway.master")
-    before = log.level
-    log.setLevel(logging.INFO)
-    log.addHandler(every)
-    log.addHandler(desk.limited)
-    began_s = clock.monotonic()
-
-    def meanwhile() -> None:
-        is_broken = int((clock.monotonic() - began_s) / 30.0) % 2
-        bench.field.silent = set(range(1, 41)) if is_broken else set()
-        desk.limited.flush_due()
-
-    try:
-        bench.run_s(1800.0, meanwhile)
-    finally:
-        log.removeHandler(every)
-        log.removeHandler(desk.limited)
-        log.setLevel(before)
-    desk.settle()
-    assert len(every.lines) > 1000
-    assert sum(1 + left_out_of(line) for line in desk.lines) == len(every.lines)
-    assert len(desk.lines) < ALL_BURST + LATE_BURST + 60 + 2 * 240  # the last: each request and unit, at the end
-    desk.limited.close()
-
-
-@given(
-    st.lists(
-        st.tuples(st.sampled_from(range(70)), st.booleans(), st.sampled_from([0.0, 1.0, 59.0, 600.0])), max_size=400
-    )
-)
-def test_whatever_comes_when_the_last_line_of_each_state_is_true_and_none_is_uncounted(
-    events: list[tuple[int, bool, float]],
-) -> None:
-    desk, last = Desk(JumpingClock()), {}
-    for _ in range(4):
-        for unit, is_back, pause_s in events:
-            template = "%s: unit %d is back" if is_back else "%s: unit %d is offline"
-            desk.log.warning(template, "field", unit, extra={"about": unit})
-            last[unit] = f"WARNING {template % ('field', unit)}"
-            desk.pass_s(pause_s)
-    desk.settle()
-    told = {int(line.split()[3]): bare(line) for line in desk.lines}
-    assert told == last
-    assert sum(1 + left_out_of(line) for line in desk.lines) == 4 * len(events)
-    desk.limited.close()
-
-
-def test_causes_without_end_take_no_memory_without_end(desk: Desk) -> None:
-    def storm(numbers: range) -> None:
-        for number in numbers:
-            desk.log.warning("%s is not allowed %d", f"{number} " + "x" * 9000, number)
-            desk.log.warning(f"{number} " + "y" * 9000)  # worded too early: a template of its own
-
-    storm(range(CAUSES_MOST + 100))
-    tracemalloc.start()
-    try:
-        storm(range(10_000, 11_000))
-        grown, _peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert grown < 500_000
-    assert len(desk.lines) == ALL_BURST
-
-
-def test_beyond_the_causes_that_are_known_the_wording_counts_and_then_anything(desk: Desk) -> None:
-    for number in range(CAUSES_MOST):
-        desk.log.warning("%s: up", f"host {number}")
-    desk.settle()
-    desk.new_lines()
-    for number in range(CAUSES_MOST):  # all are known, and most have a line that waits
-        desk.log.warning("%s: up", f"host {number}")
-    for number in range(5):
-        desk.log.warning("%s: down", f"stranger {number}")
-    for number in range(WORDINGS_MOST + 4):
-        desk.log.warning(f"wording {number}")  # worded too early: a template of its own
-    desk.settle()
-    others = [line for line in desk.lines if "host" not in line]
-    assert len(others) == WORDINGS_MOST + 1
-    assert {bare(line): left_out_of(line) for line in others if left_out_of(line)} == {
-        "WARNING stranger 4: down": 4,
-        f"WARNING wording {WORDINGS_MOST + 3}": 4,
-    }
-
-
-def test_who_is_long_quiet_makes_room_for_a_newcomer(desk: Desk) -> None:
-    for number in range(CAUSES_MOST):
-        desk.log.warning("%s: up", f"host {number}")
-    desk.settle()
-    desk.new_lines()
-    for _ in range(BURST):
-        desk.log.warning("%s: up", "newcomer")
-        desk.log.warning("%s: up", "another")
-    assert Counter(desk.lines) == {"WARNING newcomer: up": BURST, "WARNING another: up": BURST}
 
 
 # ------------------------------------------------------------------------------------------------ tracebacks

@@ -1,20 +1,13 @@
-"""Stacks of a living program, and of one that was ended by its backstop or a signal, in processes of their own.
-
-As a program (``python -m tests.test_stacks WAY FILE``) this file is a small station with a backstop that goes wrong.
-"""
+"""Stacks of a living program, and of one that was ended by its backstop or a signal, in processes of their own."""
 
 from __future__ import annotations
 
 import _thread
 import contextlib
-import ctypes
 import os
 import random
-import resource
-import selectors
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +17,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.link import Waker, wait_ready
 from gateway.stacks import (
     DUMP_BYTES,
     HEADER_BYTES,
@@ -32,228 +24,20 @@ from gateway.stacks import (
     LINES_MOST,
     SUSPECTS_MOST,
     UNKNOWN,
-    Backstop,
     Evidence,
     read_evidence,
     stack_lines,
     start_of,
 )
+from tests.changing import read as read_request
+from tests.changing import section, serial_master, slave
 from tests.lines import PATIENCE_S
-from tests.programs import until
+from tests.peers import free_port
+from tests.programs import is_listening, program, until
+from tests.struck import REARMED, ROOT, TICK_S, TIMEOUT_S, command, ended
 
-ROOT = Path(__file__).parents[1]
-TIMEOUT_S = 0.6
-TICK_S = 0.06
 ALLOWANCE_S = 1.0  # for a process to end on a busy machine
-FOR_EVER_S = 10_000
-WIPED = b"wiped\n"
-REARMED = 10_000
 Record = Callable[[str, object], None]
-
-
-# ------------------------------------------------------------------------------------------------ the station
-
-
-def idle_threads() -> None:
-    """Everybody in one of the waits that there are in a gateway."""
-    waker, selector, reader = Waker(), selectors.DefaultSelector(), os.pipe()[0]
-    selector.register(waker, selectors.EVENT_READ)
-    other = threading.Event()
-    waits: dict[str, Callable[[], object]] = {
-        "plant": lambda: wait_ready((reader,), (), None),
-        "scada": lambda: waker.wait(None),
-        "telnet": lambda: selector.select(None),
-        "signals": lambda: signal.sigwait({signal.SIGUSR2}),
-        "slow work": other.wait,
-        "joiner": lambda: next(one for one in threading.enumerate() if one.name == "plant").join(),
-    }
-    for name, wait in waits.items():
-        threading.Thread(target=wait, name=name, daemon=True).start()
-
-
-def hold_the_interpreter() -> None:
-    ctypes.PyDLL(None).sleep(FOR_EVER_S)
-
-
-def in_a_task(fault: Callable[[], object]) -> Callable[[Backstop], None]:
-    """A station whose main thread does its ticks until the thread "field" goes wrong, after some of them."""
-
-    def goes_wrong(has_ticked: threading.Semaphore) -> None:
-        for _ in range(3):
-            has_ticked.acquire()
-        say_moment()
-        fault()
-
-    def work(backstop: Backstop) -> None:
-        waker, ticks = Waker(), threading.Semaphore(0)
-        threading.Thread(target=goes_wrong, args=(ticks,), name="field", daemon=True).start()
-        while True:
-            backstop.name_threads()
-            backstop.arm(TIMEOUT_S)
-            ticks.release()
-            waker.wait(TICK_S)
-
-    return work
-
-
-def main_thread_blocked(backstop: Backstop) -> None:
-    backstop.name_threads()
-    backstop.arm(TIMEOUT_S)
-    say_moment()
-    os.read(os.pipe()[0], 1)
-
-
-def main_thread_never_back(backstop: Backstop) -> None:
-    backstop.name_threads()
-    backstop.arm(TIMEOUT_S)
-    say_moment()
-    Waker().wait(None)
-
-
-def closed_in_time(backstop: Backstop) -> None:
-    descriptors = entries("/proc/self/fd")
-    backstop.arm(0.05)
-    backstop.close()
-    backstop.close()
-    assert entries("/proc/self/fd") == descriptors - 1
-    time.sleep(0.2)
-
-
-def disarmed(backstop: Backstop) -> None:
-    backstop.arm(0.05)
-    backstop.disarm()
-    time.sleep(0.2)
-    backstop.close()
-
-
-def killed(backstop: Backstop) -> None:
-    backstop.arm(TIMEOUT_S)
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def names_kept(backstop: Backstop) -> None:
-    """Say what the file's header is each time that it should have changed or not; WIPED: it was not written."""
-    path, may_go = Path(sys.argv[2]), threading.Event()
-    first = threading.Thread(target=may_go.wait, name="first \x1b[2J")
-    first.start()
-    backstop.name_threads()
-    print(path.read_bytes()[:HEADER_BYTES].decode().split("\n")[:2], flush=True)
-    may_go.set()
-    first.join()
-    for has_newcomer in (False, True):
-        with path.open("r+b") as file:
-            file.write(WIPED)
-        if has_newcomer:
-            idle_threads()
-        backstop.name_threads()
-        print(path.read_bytes().startswith(WIPED), flush=True)
-    backstop.close()
-
-
-def file_that_takes_no_more(backstop: Backstop) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
-    for _ in range(2):
-        threading.Thread(target=threading.Event().wait, daemon=True).start()
-        backstop.name_threads()
-    backstop.close()
-
-
-def many_threads(backstop: Backstop) -> None:
-    may_go = threading.Event()
-    threads = [threading.Thread(target=may_go.wait, name=f"{n:03} {'x' * 100}") for n in range(300)]
-    for thread in threads:
-        thread.start()
-    backstop.name_threads()
-    may_go.set()
-    for thread in threads:
-        thread.join()
-    main_thread_blocked(backstop)
-
-
-def closed_then_aborted(backstop: Backstop) -> None:
-    backstop.close()
-    os.kill(os.getpid(), signal.SIGABRT)
-
-
-def rearmed(backstop: Backstop) -> None:
-    """Arm it again and again; say what that costs, and how many descriptors and KiB of memory are left of it."""
-    threads = entries("/proc/self/task")
-    backstop.arm(60.0)
-    before = entries("/proc/self/fd"), memory_kib()
-    began_s = time.perf_counter()
-    for _ in range(REARMED):
-        backstop.arm(60.0)
-    each_s = (time.perf_counter() - began_s) / REARMED
-    print(each_s, entries("/proc/self/fd") - before[0], memory_kib() - before[1], flush=True)
-    backstop.close()
-    until(lambda: entries("/proc/self/task") == threads)  # the last one is still on its way out
-
-
-def entries(folder: str) -> int:
-    return len(list(Path(folder).iterdir()))
-
-
-def memory_kib() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
-
-
-def no_threads_left(backstop: Backstop) -> None:
-    """The system gives no more threads."""
-    resource.setrlimit(resource.RLIMIT_AS, (2**28, 2**28))
-    threading.stack_size(2**28)
-    backstop.arm(TIMEOUT_S)
-    backstop.arm(TIMEOUT_S)
-    backstop.close()
-
-
-def say_moment() -> None:
-    print(time.monotonic(), flush=True)
-
-
-WAYS: dict[str, Callable[[Backstop], None]] = {
-    "a call holds the interpreter": in_a_task(hold_the_interpreter),
-    "the main thread is blocked": main_thread_blocked,
-    "the main thread never comes back": main_thread_never_back,
-    "aborted": lambda _: os.kill(os.getpid(), signal.SIGABRT),
-    "a segment that is not there": in_a_task(lambda: ctypes.string_at(0)),
-    "killed": killed,
-    "closed": closed_in_time,
-    "disarmed": disarmed,
-    "closed, then aborted": closed_then_aborted,
-    "names kept": names_kept,
-    "file that takes no more": file_that_takes_no_more,
-    "many threads": many_threads,
-    "rearmed": rearmed,
-    "no threads left": no_threads_left,
-}
-
-
-def main(way: str, path: Path, *options: str) -> None:
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    if "full" in options:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
-    backstop = Backstop(path, is_monotonic=False if "wall clock" in options else None)
-    if way not in ("names kept", "rearmed", "no threads left"):
-        idle_threads()
-    if "wall clock" in options:
-        backstop.arm(TIMEOUT_S)
-    WAYS[way](backstop)
-
-
-def command(way: str, path: Path, *options: str) -> list[str]:
-    return [sys.executable, "-m", "tests.test_stacks", way, str(path), *options]
-
-
-def ended(way: str, path: Path, *options: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command(way, path, *options),
-        cwd=ROOT,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=4 * PATIENCE_S,
-    )
 
 
 # ------------------------------------------------------------------------------------------------ what is left of it
@@ -401,7 +185,11 @@ def test_handlers_that_were_there_before_come_back_in_the_end(tmp_path: Path) ->
 def test_the_threads_of_a_real_gateway_that_does_nothing_are_all_in_waits_that_are_known(tmp_path: Path) -> None:
     """Whoever gives a task another wait learns here that ``stacks`` has to know it, or names innocents."""
     port = free_port()
-    text = serial_master("gone", "/dev/rtugate-is-not-there", read_request(0)) + slave("scada", port) + telnet(free_port())
+    text = (
+        serial_master("gone", "/dev/rtugate-is-not-there", read_request(0))
+        + slave("scada", port)
+        + section("[hmi.telnet]", listen=f"127.0.0.1:{free_port()}")
+    )
     with program(tmp_path, text) as gateway:
         gateway.started(environment={"PYTHONFAULTHANDLER": "1"})
         gateway.wait_for("telnet server: listening")
@@ -610,7 +398,3 @@ def test_a_thread_that_nobody_named_is_told_as_well() -> None:
     finally:
         may_go.release()
     assert any(line.startswith("a thread without a name (0x") for line in lines)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), *sys.argv[3:])

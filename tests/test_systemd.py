@@ -170,11 +170,12 @@ def test_it_is_fed_between_a_quarter_and_a_half_of_its_time(
 ) -> None:
     systemd = a_systemd(WATCHDOG_USEC=str(watchdog_s * 1_000_000), WATCHDOG_PID=str(os.getpid()))
     fed_at_s: list[float] = []
-    while len(fed_at_s) < 20:
+    while clock.monotonic() < 1000.0 + 8 * watchdog_s:
         wait_s = systemd.feed()
         fed_at_s += [clock.monotonic() for _ in manager.heard()]
         clock.pass_s(min(tick_s, wait_s))
     assert fed_at_s[0] == 1000.0
+    assert len(fed_at_s) >= 16
     gaps = [(after - before) / watchdog_s for before, after in itertools.pairwise(fed_at_s)]
     assert min(gaps) >= 0.25
     assert max(gaps) <= 0.5
@@ -257,7 +258,7 @@ def test_an_address_that_is_none_is_logged_and_ignored(
     assert line.endswith(reason)
 
 
-@pytest.mark.parametrize("address", ["/tmp/" + "x" * 102, "@" + "x" * 107])  # noqa: S108 - nothing is there
+@pytest.mark.parametrize("address", ["/nowhere/" + "x" * 98, "@" + "x" * 107])
 def test_an_address_as_long_as_may_be_is_used(a_systemd: Make, caplog: pytest.LogCaptureFixture, address: str) -> None:
     a_systemd(NOTIFY_SOCKET=address).ready()
     (line,) = lines(caplog)

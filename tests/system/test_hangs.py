@@ -1,6 +1,6 @@
 """The table of hangs: tasks times ways to hang, each provoked in the real process (spec section 7; `tests/hanging`).
 
-Every figure is the worst of its runs, from the moment of the fault. It was noticed when the log says so or, where nobody
+Every figure is the worst of its runs, from the moment of the fault. It was noticed when the log says so or, where none
 is left to log it, when the process has ended. The limit is `watchdog.timeout` and one tick, and ``ALLOWED_S`` for the
 measuring: the test hears of it by a pipe, and four gateways and their devices share the machine.
 """

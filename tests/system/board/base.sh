@@ -16,7 +16,8 @@ echo '/dev/vda / ext4 defaults 0 0' >"$root/etc/fstab"
 install -m 755 "$here/agent.sh" "$root/usr/local/sbin/board-agent"
 install -m 644 "$here/agent.service" "$root/etc/systemd/system/board-agent.service"
 systemctl --root="$root" --quiet enable board-agent.service
-systemctl --root="$root" --quiet mask apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer getty@tty1.service
+systemctl --root="$root" --quiet mask apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer
+systemctl --root="$root" --quiet mask getty@tty1.service getty-static.service
 
 # Debian's own initrd looks for every disk there is, which takes a software processor 5 s at each boot.
 mkdir -p "$root/initrd/bin" "$root/initrd/dev" "$root/initrd/root"

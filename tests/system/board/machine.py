@@ -14,7 +14,6 @@ import base64
 import contextlib
 import itertools
 import json
-import os
 import selectors
 import shlex
 import socket
@@ -36,7 +35,7 @@ LOOK_EVERY_S: Final = 0.05  # nothing tells a test that a simulated device was p
 UART_IRQS: Final = (4, 3, 5, 7)  # each its own: a PC's third and fourth share those of the first two
 PROCESSOR: Final = ("-accel", "tcg,tb-size=64", "-cpu", "max,-cx16")  # other sizes boot slower; with cx16 Linux dies
 KERNEL_WORDS: Final = (
-    "root=/dev/vda console=hvc0 quiet systemd.show_status=no systemd.getty_auto=no "
+    "console=hvc0 quiet systemd.show_status=no systemd.getty_auto=no systemd.condition-needs-update=no "
     "systemd.journald.forward_to_console=1 systemd.journald.max_level_console=info"
 )  # no panic=: a kernel that is dead is the watchdog's affair
 
@@ -228,16 +227,28 @@ class Machine:
 
     def order(self, script: str, limit_s: float = ORDER_LIMIT_S) -> tuple[int, str]:
         """Have the board's shell carry out *script*, as root; return its exit code and all that it said."""
-        tag = str(next(self._tags))
-        self._agent.send(f"{tag} {base64.b64encode(script.encode()).decode()}\n".encode())
+        tag = self._send(script)
         self.until(lambda: tag in self._answers, f"an answer to {script!r}", limit_s)
         return self._answers.pop(tag)
+
+    def answers(self) -> bool:
+        """Tell whether it is on, and carries out orders."""
+        if self._qemu is None or self._qemu.poll() is not None:
+            return False
+        tag = self._send("true")
+        return self.watch(lambda: tag in self._answers, SOON_S)
 
     def do(self, script: str, limit_s: float = ORDER_LIMIT_S) -> str:
         """``order`` what has to succeed; return what it said, without the last line's end."""
         code, said = self.order(f"set -e\n{script}", limit_s)
         assert code == 0, f"{script!r} ended with {code}:\n{said}"
         return said.rstrip("\n")
+
+    def _send(self, script: str) -> str:
+        """Send an order; return its tag."""
+        tag = str(next(self._tags))
+        self._agent.send(f"{tag} {base64.b64encode(script.encode()).decode()}\n".encode())
+        return tag
 
     def put(self, path: str, text: str) -> None:
         """Write a file of the board."""

@@ -29,7 +29,7 @@ from tests.system.board.machine import Machine, machine
 
 ROOT: Final = HERE.parents[2]
 CONFIG: Final = "/etc/rtugate/rtugate.toml"
-STATE: Final = "/var/lib/rtugate"
+DROP_INS: Final = "/run/systemd/system/rtugate.service.d"
 METER_UNIT, BOILER_UNIT, OUR_UNIT = 2, 17, 1
 BAUD: Final = 19200
 TIMEOUT_S: Final = 5.0  # of a task without progress
@@ -98,13 +98,31 @@ def configuration(unit: int = OUR_UNIT) -> str:
     )
 
 
+class TimedDevice(Device):
+    """A device that notes when it is read; ``longest_s``: the longest time that passed between two readings."""
+
+    last_s: float | None = None
+    longest_s: float = 0.0
+
+    def get(self, table: Table, address: int, count: int = 1) -> list[int]:
+        now_s = time.monotonic()
+        if self.last_s is not None:
+            self.longest_s = max(self.longest_s, now_s - self.last_s)
+        self.last_s = now_s
+        return super().get(table, address, count)
+
+    def forget(self) -> None:
+        """Note anew from now on."""
+        self.last_s, self.longest_s = None, 0.0
+
+
 class Station:
     """The board in its house.
 
     meter:  polled on ttyS0, its 4 holding registers become 0 to 3; boiler: on ttyS3, its 2 become 100 and 101.
     """
 
-    def __init__(self, board: Machine, meter: Device, boiler: Device, upper_line: str) -> None:
+    def __init__(self, board: Machine, meter: TimedDevice, boiler: TimedDevice, upper_line: str) -> None:
         self.board, self.meter, self.boiler = board, meter, boiler
         self._upper_line = upper_line
         self._numbers = iter(range(1000, 65000))
@@ -124,7 +142,7 @@ class Station:
 
     def ask(self, count: int = 4, unit: int = OUR_UNIT, address: int = 0) -> list[int]:
         """Return what the upper master reads; nothing where it gets no answer."""
-        return re_values(self._ask("-r", str(address), "-c", str(count), unit=unit))
+        return values_of(self._ask("-r", str(address), "-c", str(count), unit=unit))
 
     def _ask(self, *words: str, unit: int) -> str:
         line = ["-m", "rtu", "-b", str(BAUD), "-P", "none", "-o", str(ANSWER_S), "-0", "-1", "-t", "4", "-a", str(unit)]
@@ -181,25 +199,35 @@ class Station:
         self.board.do("systemctl restart rtugate.service")
         self.wait_polling()
 
-    def drop_in(self, name: str, text: str) -> None:
-        """Change the unit, until the machine is restarted."""
-        self.board.put(f"/run/systemd/system/rtugate.service.d/{name}.conf", text)
+    def settle(self) -> None:
+        """Undo whatever was done to it; return once everything works."""
+        if not self.board.answers():
+            self.board.cut_power()
+            self.board.start()
+        self.board.do(f"rm -rf {DROP_INS} && systemctl daemon-reload")
+        self.configure()
+        self.restart()
+
+    def configure(self, unit: int = OUR_UNIT) -> None:
+        """Write the board's file."""
+        self.board.put(CONFIG, configuration(unit))
+        self.board.do("chown -R rtugate: /etc/rtugate && sync")
+
+    def drop_in(self, text: str) -> None:
+        """Change the unit, until ``settle`` or until the machine is restarted."""
+        self.board.put(f"{DROP_INS}/test.conf", text)
         self.board.do("systemctl daemon-reload")
 
-    @contextmanager
-    def with_faults(self, more: str = "") -> Iterator[None]:
-        """Meanwhile the service is the same gateway with faults to order; *more*: of the unit's [Service].
+    def fit_faults(self, restart: str) -> None:
+        """The service is now the same gateway with faults to order, and systemd restarts it so: "no", "always".
 
-        Whoever restarts the machine meanwhile has ended it already.
+        Until ``settle``, or until the machine is reset.
         """
         self.board.do("mkdir -p /run/faults && chown rtugate: /run/faults")
         program = "/usr/bin/python3 -m tests.hanging run"
         paths = "PYTHONPATH=/usr/share/rtugate-faults:/usr/share/rtugate"
         environment = f"Environment={paths} RTUGATE_FAULT={ORDER}"
-        self.drop_in("faults", f"[Service]\nExecStart=\nExecStart={program}\n{environment}\n{more}\n")
-        self.restart()
-        yield
-        self.board.do("rm -rf /run/systemd/system/rtugate.service.d && systemctl daemon-reload")
+        self.drop_in(f"[Service]\nExecStart=\nExecStart={program}\n{environment}\nRestart={restart}\n")
         self.restart()
 
     def commit(self, who: str, kind: str) -> None:
@@ -207,7 +235,7 @@ class Station:
         self.board.do(f"printf {who}:{kind} >{ORDER}.new && chown rtugate: {ORDER}.new && mv {ORDER}.new {ORDER}")
 
 
-def re_values(told: str) -> list[int]:
+def values_of(told: str) -> list[int]:
     """Return the values that mbpoll prints: "[0]:  4711", or "[0]:  65535 (-1)"."""
     return [int(value) for value in re.findall(r"^\[\d+\]:\s+(\d+)", told, re.MULTILINE)]
 
@@ -220,7 +248,7 @@ def station(folder: Path, delivery: Delivery = SOURCES) -> Iterator[Station]:
     parts.mkdir(parents=True)
     delivery.fill(parts)
     _bring_faults(parts)
-    meter, boiler = Device("meter", METER_UNIT), Device("boiler", BOILER_UNIT)
+    meter, boiler = TimedDevice("meter", METER_UNIT), TimedDevice("boiler", BOILER_UNIT)
     meter.set(Table.HOLDING_REGISTERS, 0, [0] * 4)
     boiler.set(Table.HOLDING_REGISTERS, 107, [0] * 2)
     with contextlib.ExitStack() as stack:
@@ -231,6 +259,7 @@ def station(folder: Path, delivery: Delivery = SOURCES) -> Iterator[Station]:
         board = stack.enter_context(machine(folder / "board", base(delivery.packages), parts, wires))
         board.do(f"mount -o ro /dev/vdb /mnt\n{delivery.script}")
         board.do("cp -r /mnt/faults /usr/share/rtugate-faults")
-        board.put(CONFIG, configuration())
-        board.do("chown -R rtugate: /etc/rtugate\nsync\nsystemctl start rtugate.service")
-        yield Station(board, meter, boiler, far)
+        made = Station(board, meter, boiler, far)
+        made.configure()
+        board.do("systemctl start rtugate.service")
+        yield made
