@@ -58,7 +58,7 @@ class Guard:
         self._leave = leave
         self._settings: tuple[str, int] = ("", 0)
         self._device: WatchdogDevice | None = None
-        self._is_fed = self._is_ready = self._is_over = False
+        self._is_fed = self._is_ready = self._is_over = self._has_told_reset = False
         supervisor.hung = self.hung
         supervisor.before_stops = self._before_stops
         supervisor.chores.append(self.tick)
@@ -91,9 +91,10 @@ class Guard:
 
     def _feed(self, device: WatchdogDevice) -> None:
         device.feed()
-        if not self._is_fed and device.reset_machine:
-            self.has_reset(self._last_run.reset_by_watchdog())
         self._is_fed = True
+        if device.reset_machine and not self._has_told_reset:
+            self._has_told_reset = True
+            self.has_reset(self._last_run.reset_by_watchdog())
 
     def hung(self, names: Sequence[str]) -> None:
         """End the process because the tasks of these *names* hang."""
@@ -141,7 +142,7 @@ class Guard:
 
     def device_state(self) -> Told | None:
         """Return how the hardware watchdog fares; None if there is to be none."""
-        device, (path, timeout_s) = self._device, self._settings
+        device, path = self._device, self._settings[0]
         if device is None:
             return None
         if device.trouble:
@@ -149,4 +150,4 @@ class Guard:
         if not self._is_fed:
             return Told(N_("{device}: not opened yet; that comes when all lines have begun"), {"device": path})
         text = N_("{device}: well; without us it resets the machine after {seconds} s")
-        return Told(text, {"device": path, "seconds": timeout_s})
+        return Told(text, {"device": path, "seconds": f"{device.counts_s:.0f}"})

@@ -86,6 +86,7 @@ class Waker:
         self._waiters = 0  # in other threads, that need the descriptor of the end
         self._is_closing = False
         self.ended = False  # True: every wait ends at once, for good
+        self.wakes = 0  # that have come and were cleared
 
     def end(self) -> None:
         """End the present wait and all that follow: the thread that waits is to stop. From any thread."""
@@ -111,6 +112,7 @@ class Waker:
             return
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._fd)
+            self.wakes += 1
 
     def wait(self, timeout_s: float | None) -> bool:
         """True when woken, which is then cleared; False after *timeout_s* (None: no limit)."""

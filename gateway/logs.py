@@ -7,7 +7,9 @@ Whatever a person or a device can put into a name or a line is logged with its c
 in ten minutes; of all causes together 200, then one a minute. Of what is held back the newest line of each cause is
 told late, once that has been quiet for ten minutes, with the time it happened, and how many more there were: in a storm
 one a minute, after it all. So the log ends with how things are. That holds for each cause: lines of different wording
-that tell one state say that they are about the same thing (``extra={"about": "field: unit 5"}``), and are one cause.
+that tell one state, be it in two modules, say that they are about the same (``extra={"about": "field: unit 5"}``), and
+are one cause. A count behind a name ("field: 3 writes are lost") would make each line a cause of its own, as a unit
+does: such a line says what it is about as well. ``extra={"is_unlimited": True}`` is for what must never wait.
 
 Measured with a real master of 1000 requests on 200 units (0.1 s to wait for a reply) whose wire breaks and heals every
 30 s for a month: 230,000 lines and 7.4 megabytes a day without the limits; with them 2900 lines and a quarter of a
@@ -49,7 +51,6 @@ REST_MOST: Final = 50  # late lines told when the program ends
 CAUSES_MOST: Final = 2000  # known one by one: 1000 requests and their units
 WORDINGS_MOST: Final = 200  # known beyond that
 CAUSE_LONGEST: Final = 100  # characters of a name by which causes are told apart
-WHOLE_AGAIN_S: Final = 86400.0  # a traceback that was told is not told again for so long
 SUFFIX_LONGEST: Final = 200
 
 
@@ -178,12 +179,12 @@ class _Line:
     text: str
     traceback: str
 
-    def record(self, remarks: Sequence[str], traceback: str, created: float) -> logging.LogRecord:
+    def record(self, remarks: Sequence[str], created: float) -> logging.LogRecord:
         """Return it as logging knows it, with *remarks* in brackets behind its text."""
         text = f"{self.text} ({'; '.join(remarks)})" if remarks else self.text
         made = logging.LogRecord(self.name, self.level, "", 0, text, None, None)
         made.created = created
-        made.exc_text = traceback or None
+        made.exc_text = self.traceback or None
         return made
 
 
@@ -199,17 +200,14 @@ def _line_of(record: logging.LogRecord, formatter: SafeFormatter) -> _Line:
 
 
 class _Cause:
-    """How much may still be told of one cause, what was not, and the traceback that was."""
+    """How much may still be told of one cause, and what was not."""
 
-    __slots__ = ("budget", "left_out", "settles_s", "traceback", "traceback_again_s", "traceback_told")
+    __slots__ = ("budget", "left_out", "settles_s")
 
     def __init__(self) -> None:
         self.budget = _Budget(BURST, AGAIN_S)
         self.left_out = 0  # lines since the last that was told; the newest of them waits
         self.settles_s = 0.0  # when it may be told, monotonic
-        self.traceback = 0  # its hash: of the one told last
-        self.traceback_told = 0.0  # when, wall time
-        self.traceback_again_s = 0.0  # until when it is not told again, monotonic
 
 
 _Key = tuple[str, ...]
@@ -224,7 +222,7 @@ def _keys(record: logging.LogRecord) -> tuple[_Key, _Key, _Key]:
     wording = (record.name, _word(record.msg))
     about = getattr(record, "about", None)
     if about is not None:
-        return (record.name, "", _word(about)), wording, ()
+        return ("", "about", _word(about)), wording, ()  # whichever module tells it
     args = record.args if isinstance(record.args, tuple) else ()
     named = [_word(arg) for arg in args[:1] if not isinstance(arg, int | float)]
     numbered = [str(arg) for arg in args[1:2] if named and isinstance(arg, int)]
@@ -382,18 +380,7 @@ class RateLimited(logging.Handler):
         remarks = [f"told late, this was at {moment(line.created)}"] if is_late else []
         if left_out:
             remarks.append(f"{left_out} more like it {'was' if left_out == 1 else 'were'} left out")
-        traceback = line.traceback
-        if traceback and not self._is_traceback_news(cause, line):
-            remarks.append(f"the traceback is that of {moment(cause.traceback_told)}")
-            traceback = ""
-        return line.record(remarks, traceback, self._clock.wall() if is_late else line.created)
-
-    def _is_traceback_news(self, cause: _Cause, line: _Line) -> bool:
-        now_s, known = self._clock.monotonic(), hash(line.traceback)
-        if known == cause.traceback and now_s < cause.traceback_again_s:
-            return False
-        cause.traceback, cause.traceback_told, cause.traceback_again_s = known, line.created, now_s + WHOLE_AGAIN_S
-        return True
+        return line.record(remarks, self._clock.wall() if is_late else line.created)
 
 
 def _is_unlimited(record: logging.LogRecord) -> bool:

@@ -130,9 +130,10 @@ class SerialSlave:
         self._link, self._is_talk = None, False
 
     def _listen(self, link: Link) -> bool:
-        """Return whether something came, or the wait had a length."""
-        now_s = self._clock.monotonic()
-        wait_s = max(0.0, self._due_s(now_s) - now_s)
+        """Return whether something came, a wake included, or the wait has run its time."""
+        now_s, wakes = self._clock.monotonic(), self._waker.wakes
+        due_s = self._due_s(now_s)
+        wait_s = max(0.0, due_s - now_s)
         data = self._read(link, wait_s)
         if self._opening.trouble:
             self._opening.worked()  # a port that opens has to be read from once before it counts
@@ -149,7 +150,7 @@ class SerialSlave:
         if self._framer.pending and now_s >= self._heard_s + self.config.character_timeout_used:
             self._framer.reset()
         self.counters.damaged = self._framer.damaged
-        return bool(data) or wait_s > 0.0
+        return bool(data) or self._waker.wakes > wakes or (wait_s > 0.0 and now_s >= due_s)
 
     def _read(self, link: Link, timeout_s: float) -> bytes:
         data = link.read(timeout_s)

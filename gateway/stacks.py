@@ -149,9 +149,14 @@ class Backstop:
         faulthandler.cancel_dump_traceback_later()
 
     def name_threads(self) -> None:
-        """Have the file say which thread is which task; it is written only when there is a new one. Never raises."""
-        names = {thread.ident: _name_of(thread) for thread in threading.enumerate() if thread.ident is not None}
-        if self._fd == STDERR or names.items() <= self._names.items():
+        """Have the file say which thread is which task; it is written only when there is a new one. Never raises.
+
+        Daemons are short-lived helpers, and not worth a write each: they stay without a name, and get nobody else's.
+        """
+        threads = [(thread.ident, thread) for thread in threading.enumerate() if thread.ident is not None]
+        names = {ident: _name_of(thread) for ident, thread in threads if not thread.daemon}
+        has_misnamed = any(thread.daemon and ident in self._names for ident, thread in threads)
+        if self._fd == STDERR or (names.items() <= self._names.items() and not has_misnamed):
             return
         self._names = names
         try:

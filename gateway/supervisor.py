@@ -14,6 +14,7 @@ handler or any thread.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import traceback
 from collections import Counter, deque
@@ -119,7 +120,20 @@ class Supervisor:
     def hanging(self) -> list[str]:
         """Return the names of the tasks that hang, those included that were told to stop."""
         limit_s = self._clock.monotonic() - self.timeout_s
-        return [runner.plan.name for runner in [*self._runners, *self._leaving] if runner.hangs_since(limit_s)]
+        return [runner.plan.name for runner in self._watched if runner.quiet_since_s < limit_s]
+
+    def _look_at_flags(self) -> float:
+        """Tell of tasks that hang; return how long no other can."""
+        hanging = self.hanging()
+        if hanging:
+            self.hung(hanging)
+        quiet_since_s = min((runner.quiet_since_s for runner in self._watched), default=math.inf)
+        left_s = quiet_since_s + self.timeout_s - self._clock.monotonic()
+        return min(self.tick_s, left_s) if left_s > 0 else self.tick_s
+
+    @property
+    def _watched(self) -> list[_Runner]:
+        return [*self._runners, *self._leaving]
 
     @property
     def leaving(self) -> list[str]:
@@ -166,10 +180,8 @@ class Supervisor:
             while not self._stop.is_set():
                 while self._jobs and not self._stop.is_set():
                     self._jobs.popleft()()
-                waits_s = [self.tick_s] + [runner.look_after() for runner in self._runners]
-                hanging = self.hanging()
-                if hanging:
-                    self.hung(hanging)
+                waits_s = [runner.look_after() for runner in self._runners]
+                waits_s.append(self._look_at_flags())
                 self._waker.wait(min(waits_s + [do() for do in self.chores]))
         finally:
             clean = self._stop_all()
@@ -228,11 +240,13 @@ class _Runner:
         task = self.task
         return self._restart_s is not None or (task is not None and task.ready.is_set())
 
-    def hangs_since(self, limit_s: float) -> bool:
-        """Whether it should be at work, or has still to end, and has got on with nothing since *limit_s*, monotonic."""
-        if self._thread is None or self._restart_s is not None or self._alive_s >= limit_s:
-            return False
-        return self._thread.is_alive() or not self._stop.is_set()
+    @property
+    def quiet_since_s(self) -> float:
+        """When it got on with something last, monotonic; infinity while it is not expected to."""
+        if self._thread is None or self._restart_s is not None:
+            return math.inf
+        is_expected = self._thread.is_alive() or not self._stop.is_set()
+        return self._alive_s if is_expected else math.inf
 
     def start(self) -> None:
         self._restart_s = None

@@ -179,7 +179,7 @@ class WatchdogDevice:
         self._fd = -1
         self._is_over = False
         self._pings = False  # it is fed by ioctl, else by writing
-        self._counts_s = float(timeout_s)  # how long it really waits to be fed
+        self.counts_s = float(timeout_s)  # how long it really waits to be fed, as far as it says so
         self._resets_at_s = float("-inf")  # when it will reset the machine, if it is not fed again
         self._opened_at_s = self._due_s = clock.monotonic()
         self._after_s = FIRST_S
@@ -200,7 +200,7 @@ class WatchdogDevice:
             self._tell(nature)
         elif now_s - self._opened_at_s >= MOST_S:
             self._after_s = FIRST_S
-        self._resets_at_s = now_s + self._counts_s
+        self._resets_at_s = now_s + self.counts_s
 
     def close(self, clean: bool) -> None:
         """Stop it, if *clean*, else leave it counting; never opened again. Never raises; again does nothing."""
@@ -227,8 +227,8 @@ class WatchdogDevice:
             raise LinkUnavailable(f"{self._name}: is a file or a disk and no watchdog")
         nature = self._examine(stat.S_ISCHR(mode))
         self._pings = bool((nature.options or 0) & KEEP_ALIVE_PING)
-        self._counts_s = float(nature.timeout_s or self._timeout_s)
-        self._resets_at_s = self._clock.monotonic() + self._counts_s  # it counts, whether feeding it works or not
+        self.counts_s = float(nature.timeout_s or self._timeout_s)
+        self._resets_at_s = self._clock.monotonic() + self.counts_s  # it counts, whether feeding it works or not
         return nature
 
     def _examine(self, is_device: bool) -> _Nature:
@@ -292,7 +292,7 @@ class WatchdogDevice:
         log.log(level, "watchdog: %s; trying again", reason)
         self.trouble = reason
         now_s = self._clock.monotonic()
-        most_s = self._counts_s / 4 if now_s < self._resets_at_s else MOST_S
+        most_s = self.counts_s / 4 if now_s < self._resets_at_s else MOST_S
         self._due_s = now_s + min(self._after_s, most_s)
         self._after_s = min(MOST_S, 2 * self._after_s)
 

@@ -34,6 +34,7 @@ from gateway.supervisor import Plan, Task
 
 CONTROL, SERIAL_CONSOLE, TELNET = "control socket", "serial console", "telnet server"  # no line can be called that
 CONNECT_LIMIT_S = 5.0  # a TCP device that does not take a connection by then is not there
+LEAST_WAIT_S = 0.3  # less than a third of the shortest watchdog.timeout (1 s): for a task that no configuration changes
 
 
 class Station:
@@ -157,7 +158,7 @@ def control_plan(shared: Shared, listen: Callable[[], socket], commands: Command
     """Return how the control socket's task is made; it never changes."""
 
     def make(waker: Waker) -> Terminals:
-        return Terminals(CONTROL, shared.clock, waker, listen, ControlDoor(shared, commands))
+        return Terminals(CONTROL, shared.clock, waker, listen, ControlDoor(shared, commands), LEAST_WAIT_S)
 
     return Plan(CONTROL, make)
 

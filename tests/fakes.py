@@ -80,6 +80,7 @@ class JumpingWaker(Waker):
     def __init__(self, clock: JumpingClock) -> None:
         self._clock = clock
         self.is_woken = self.ended = False
+        self.wakes = 0
         self.waits_s: list[float] = []
 
     def wake(self) -> None:
@@ -89,6 +90,7 @@ class JumpingWaker(Waker):
         return -1
 
     def clear(self) -> None:
+        self.wakes += self.is_woken
         self.is_woken = False
 
     def wait(self, timeout_s: float | None) -> bool:

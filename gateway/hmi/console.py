@@ -171,9 +171,11 @@ class SerialConsole:
             session.hang_up()
 
     def _carry(self, link: Link, session: Session) -> bool:
-        """Return whether bytes went either way, or the wait had a length."""
+        """Return whether bytes went either way, a wake came, or the wait has run its time."""
+        began_s, wakes = self._clock.monotonic(), self._waker.wakes
         wait_s = self._wait_s(session)
         data = link.read(wait_s)
+        has_waited = wait_s > 0.0 and self._clock.monotonic() >= began_s + wait_s
         if self._opening.trouble:
             self._opening.worked()  # a port that opens has to be read from once before it counts
         typed = self._bytes.receive(data)
@@ -186,7 +188,7 @@ class SerialConsole:
         if part:
             link.write(part)
             session.sent(len(part))
-        return bool(data or part) or wait_s > 0.0
+        return bool(data or part) or self._waker.wakes > wakes or has_waited
 
     def _wait_s(self, session: Session) -> float:
         """How long nothing is to be done but listen; 0 while something waits to be written."""

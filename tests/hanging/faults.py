@@ -35,7 +35,6 @@ from gateway.slave_tcp import TcpSlave
 ORDER: Final = "RTUGATE_FAULT"  # the environment's name for the path of the order
 MOMENT: Final = ".moment"  # behind that path: the file with the time of the fault, CLOCK_MONOTONIC in seconds
 SUPERVISOR: Final = "main thread"
-OTHER: Final = "the other one"  # who takes part in a deadlock
 EXIT: Final = {"x86_64": 60, "i686": 1, "aarch64": 93, "armv7l": 1}  # exit(2), of one thread; asm/unistd.h
 LONG_S: Final = 10_000
 
@@ -91,7 +90,7 @@ def deadlock(_task: Any) -> None:
             ours.acquire()
 
     ours.acquire()
-    threading.Thread(target=take_crosswise, name=OTHER, daemon=True).start()
+    threading.Thread(target=take_crosswise, name="the other one", daemon=True).start()
     is_taken.wait()
     theirs.acquire()
 
@@ -135,7 +134,7 @@ def ready(task: Any) -> None:
 def due(task: Any) -> None:
     """From now on something is due for ever and never done: the task turns round and round."""
     if hasattr(task, "_carry_out_poll"):  # a poll, of a master
-        task._carry_out_poll = lambda _line: False
+        task._carry_out_poll, task._wait_s = lambda _line: False, lambda: 0.0
     elif hasattr(task, "_due_s"):  # the end of a silence, on a serial slave
         task._due_s = lambda now_s: now_s
     else:
@@ -154,6 +153,13 @@ def journal(_task: Any) -> None:
     logging.getLogger("gateway").error("nobody reads this")
 
 
+def register(task: Any) -> None:
+    """The thread hangs while it holds the one lock that all others need."""
+    task._register._lock.acquire()
+    os.read(os.pipe()[0], 1)
+
+
 FAULTS: Final[dict[str, Callable[[Any], None]]] = {
-    fault.__name__: fault for fault in (deadlock, loop, blocked, leave, vanish, interpreter, ready, due, journal)
+    fault.__name__: fault
+    for fault in (deadlock, loop, blocked, leave, vanish, interpreter, ready, due, journal, register)
 }
