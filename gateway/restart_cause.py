@@ -125,13 +125,20 @@ class LastRun:
         """Safe mode is over. *row*: bad restarts that count all the same. Waits for nothing."""
         self._write_later(replace(self._run, bad_in_row=_one_more(row)))
 
-    def hung(self, names: Sequence[str]) -> None:
-        """The tasks of these *names* hang, and the process is about to be ended: within HUNG_LIMIT_S. Never raises."""
+    def hung(self, names: Sequence[str], meanwhile: Callable[[], None] = lambda: None) -> None:
+        """The tasks of these *names* hang, and the process is about to be ended: within HUNG_LIMIT_S. Never raises.
+
+        meanwhile: done while the mark is being written; what blocks there does not keep it from the disk.
+        """
         run = replace(self._run, hung=_safe(names) or (UNKNOWN,))
         try:
-            self._write_later(run).join(HUNG_LIMIT_S)
+            writer = self._write_later(run)
         except RuntimeError:  # there may be no more threads; a disk that hangs as well is the backstop's
             self._write(run)
+            meanwhile()
+            return
+        meanwhile()
+        writer.join(HUNG_LIMIT_S)
 
     def end(self, how: str) -> None:
         """Say that it ends, and *how*."""
