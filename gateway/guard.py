@@ -99,13 +99,14 @@ class Guard:
     def hung(self, names: Sequence[str]) -> None:
         """End the process because the tasks of these *names* hang."""
         self._is_over = True
-        log.critical(
-            "%s: got on with nothing for %g s: ending the process", ", ".join(names), self._supervisor.timeout_s
-        )
+        self._last_run.hung(names, lambda: self._tell_hang(names))
+        self._leave(HUNG_EXIT)
+
+    def _tell_hang(self, names: Sequence[str]) -> None:
+        timeout_s = self._supervisor.timeout_s
+        log.critical("%s: got on with nothing for %g s: ending the process", ", ".join(names), timeout_s)
         for line in stack_lines(names):
             log.critical("%s", line)
-        self._last_run.hung(names)
-        self._leave(HUNG_EXIT)
 
     def did_not_stop(self) -> None:
         """End the process because tasks have not stopped in time."""

@@ -388,7 +388,7 @@ class Master:
         poll.is_bad = False
         if poll.is_told:
             poll.is_told = False
-            log.info("%s: good again", poll.source)
+            log.info("%s: good again", poll.source, extra={"about": poll.source})
 
     def _poll_failed(self, poll: Poll, index: int, response: Response) -> None:
         poll.failed_tries += 1
@@ -399,7 +399,7 @@ class Master:
         poll.failed_tries = 0
         if not poll.is_told and not poll.device.is_offline:
             poll.is_told = True
-            log.warning("%s: %s", poll.source, response.reason)
+            log.warning("%s: %s", poll.source, response.reason, extra={"about": poll.source})
         poll.spoil(self._register)
 
     def _send_command(self, line: Line, command: Command) -> None:
@@ -472,13 +472,13 @@ class Master:
                 self._back(device)
             return
         if device.failed():
-            log.warning("%s: unit %d is offline: %s", self.name, device.unit, response.reason)
+            log.warning("%s: unit %d is offline: %s", self.name, device.unit, response.reason, extra=device.told)
             self._offline.add(device)
             self._online &= ~device.polls
             device.spoil(self.polls, self._register)
 
     def _back(self, device: Device) -> None:
-        log.warning("%s: unit %d is back", self.name, device.unit)
+        log.warning("%s: unit %d is back", self.name, device.unit, extra=device.told)
         device.is_offline = False
         self._offline.discard(device)
         self._online |= device.polls

@@ -99,7 +99,7 @@ class Opening(Generic[T]):
         """Say so once, and wait longer each time. Returns True the first time since the line worked."""
         is_news = not self.trouble
         level = logging.ERROR if is_news else logging.DEBUG
-        log.log(level, "%s: %s; trying again", self._name, reason)
+        log.log(level, "%s: %s; trying again", self._name, reason, extra={"about": self._name})
         self.trouble = reason
         self._due_s = self._clock.monotonic() + self._after_s
         self._after_s = min(MOST_S, 2 * self._after_s)
@@ -108,7 +108,7 @@ class Opening(Generic[T]):
     def worked(self) -> None:
         """The line is open and works."""
         if self.trouble:
-            log.warning("%s: the line works again", self._name)
+            log.warning("%s: the line works again", self._name, extra={"about": self._name})
         self.trouble, self._after_s = "", FIRST_S
 
     def close(self) -> None:

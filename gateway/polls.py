@@ -41,13 +41,14 @@ class Status(IntEnum):
 
 @dataclass(eq=False)
 class Device:
-    """One unit on the line. *polls*: its scheduled requests as bits; *outlets*: its writes."""
+    """One unit on the line. *polls*: its scheduled requests as bits; *outlets*: its writes; *told*: with log lines."""
 
     unit: int
     failures_in_row: int = 0
     is_offline: bool = False
     polls: int = 0
     outlets: set[Outlet] = field(default_factory=set)
+    told: dict[str, str] = field(default_factory=dict)
 
     def failed(self) -> bool:
         """Count a failure; return True if it is the one that takes the device offline."""
@@ -168,7 +169,9 @@ def polls_of(master: MasterConfig) -> tuple[list[Poll], dict[int, Device]]:
     enabled = [request for request in master.request if request.enabled]
     polls: list[Poll] = []
     for request in sorted(enabled, key=lambda r: not r.is_read and r.trigger == "change"):
-        device = devices.setdefault(request.unit, Device(request.unit))
+        device = devices.setdefault(
+            request.unit, Device(request.unit, told={"about": f"{master.name}: unit {request.unit}"})
+        )
         source = Source(SourceKind.REQUEST, f"{master.name}/{request.title}")
         poll = Poll(request, device, source, master.response_timeout_of(request))
         if poll.is_scheduled:

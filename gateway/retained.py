@@ -384,7 +384,7 @@ class Retainer:
     def _tell(self, problem: str) -> None:
         """Log what has changed, once."""
         if problem and problem != self._file.trouble:
-            log.error("%s: %s", self.name, problem)
+            log.error("%s: %s", self.name, problem, extra={"about": self.name})
         elif not problem and self._file.trouble:
-            log.warning("%s: saved again", self.name)
+            log.warning("%s: saved again", self.name, extra={"about": self.name})
         self._file.trouble = problem

@@ -111,7 +111,7 @@ class _Service:
             self._guard.did_not_stop()
         self._guard.close()
         self._last_run.end(BY_MENU if self.gateway.wants_restart else CLEAN)
-        log.info("stopped")
+        log.info("stopped", extra={"is_unlimited": True})
 
     def _run(self, listen: Callable[[], socket]) -> bool:
         gateway, guard = self.gateway, self._guard

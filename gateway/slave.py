@@ -121,7 +121,7 @@ class SerialSlave:
             return
         self._silence_s = silence_s(self.config.baudrate, self._link.character_s)
         self._framer.reset()
-        log.info("%s: listening on %s", self.name, self.config.line)
+        log.info("%s: listening on %s", self.name, self.config.line, extra={"about": self.name})
 
     def _let_go(self) -> None:
         if self._link is not None:

@@ -150,7 +150,7 @@ class TcpSlave:
         self._opening.worked()
         self.port = self._listener.getsockname()[1]
         self._selector.register(self._listener, selectors.EVENT_READ)
-        log.info("%s: listening on %s", self.name, self.config.line)
+        log.info("%s: listening on %s", self.name, self.config.line, extra={"about": self.name})
 
     def _let_go(self) -> None:
         for client in list(self.clients.values()):

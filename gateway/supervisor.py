@@ -329,7 +329,8 @@ class _Runner:
                 "%s: ended with an error; starting it again in %.0f s", name, self._restart_after_s, exc_info=error
             )
         else:
-            log.error("%s: ended with the same error, %d times by now: %r", name, self._causes[cause], error)
+            times, about = self._causes[cause], {"about": f"{name}: errors"}  # or each count were a cause of its own
+            log.error("%s: ended with the same error, %d times by now: %r", name, times, error, extra=about)
         self._restart_s = self._clock.monotonic() + self._restart_after_s
         self._restart_after_s = min(RESTART_MOST_S, 2 * self._restart_after_s)
         self._told(True)

@@ -136,9 +136,9 @@ class Systemd:
         if trouble == self._trouble:
             return
         if trouble:
-            log.warning("systemd: cannot be told anything: %s; trying again", trouble)
+            log.warning("systemd: cannot be told anything: %s; trying again", trouble, extra={"about": "systemd"})
         else:
-            log.info("systemd: can be told again")
+            log.info("systemd: can be told again", extra={"about": "systemd"})
         self._trouble = trouble
 
 

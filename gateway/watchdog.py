@@ -78,6 +78,8 @@ _FEEDING: Final = {
 
 log = logging.getLogger(__name__)
 
+ABOUT: Final = {"about": "watchdog"}  # one cause, for the log
+
 
 class DeviceCalls(Protocol):
     """What is asked of the system; every call may raise OSError, and none may wait."""
@@ -283,13 +285,14 @@ class WatchdogDevice:
         is_plain = not (self.trouble or shortfall or nature.remarks(self._timeout_s))
         level = logging.INFO if is_plain else logging.WARNING  # also when it is over what was told as an error
         self.trouble = f"{self._name}: {shortfall}" if shortfall else ""
-        log.log(level, "watchdog: %s", f"{self._name}: {words}" + (f"; {shortfall}" if shortfall else ""))
+        told = f"{self._name}: {words}" + (f"; {shortfall}" if shortfall else "")
+        log.log(level, "watchdog: %s", told, extra=ABOUT)
 
     def _failed(self, reason: str) -> None:
         """Say so once, and wait longer each time; but while it counts, it is tried four times before it is too late."""
         self._release()
         level = logging.ERROR if reason != self.trouble else logging.DEBUG
-        log.log(level, "watchdog: %s; trying again", reason)
+        log.log(level, "watchdog: %s; trying again", reason, extra=ABOUT)
         self.trouble = reason
         now_s = self._clock.monotonic()
         most_s = self.counts_s / 4 if now_s < self._resets_at_s else MOST_S

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -80,6 +81,56 @@ class Deaf(Working):
         self.let_go.wait(20.0)
 
 
+class Obedient(Working):
+    """A task that does what the test has it do, in its own thread, and nothing by itself: no flag, no ``ready``."""
+
+    def __init__(self, name: str, enabled: bool, waker: Waker, told: list[str]) -> None:
+        super().__init__(name, enabled, waker, told)
+        self._orders: deque[tuple[Callable[[Callable[[], None]], object], threading.Event]] = deque()
+        self._has_to_leave = False
+
+    def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
+        self.thread = threading.current_thread()
+        while not stop.is_set() and not self._has_to_leave:
+            self._waker.wait(60.0)
+            while self._orders:
+                order, done = self._orders.popleft()
+                try:
+                    order(alive)
+                finally:
+                    done.set()
+
+    def raise_flag(self) -> None:
+        """Have it get on with something; return once it has."""
+        self._obey(lambda alive: alive())
+
+    def fail(self, error: BaseException) -> None:
+        """Have it end with *error*; return once its thread has ended."""
+
+        def raise_it(alive: Callable[[], None]) -> None:
+            raise error
+
+        self._obey(raise_it)
+        self._wait_for_end()
+
+    def leave(self) -> None:
+        """Have it return though nobody has told it to stop; return once its thread has ended."""
+        self._has_to_leave = True
+        self.wake()
+        self._wait_for_end()
+
+    def _obey(self, order: Callable[[Callable[[], None]], object]) -> None:
+        done = threading.Event()
+        self._orders.append((order, done))
+        self.wake()
+        assert done.wait(PATIENCE_S), "the task does not obey"
+
+    def _wait_for_end(self) -> None:
+        assert self.thread is not None
+        self.thread.join(PATIENCE_S)
+        assert not self.thread.is_alive()
+
+
 class Tasks:
     """Plans of such tasks. ``made``: each one, in order; ``told``: what happened, in order."""
 
@@ -92,6 +143,20 @@ class Tasks:
 
     def plans(self, *names: str) -> list[Plan]:
         return [self.plan(name) for name in names]
+
+    def obedient(self, name: str) -> Obedient:
+        """The one of that name that was made last."""
+        found = [task for task in self.made if task.name == name][-1]
+        assert isinstance(found, Obedient)
+        return found
+
+    def let_go(self) -> None:
+        """Have all the deaf ones end; return when they have."""
+        for task in self.made:
+            if isinstance(task, Deaf):
+                task.let_go.set()
+                if task.thread is not None:
+                    task.thread.join(PATIENCE_S)
 
     def _make(self, name: str, enabled: bool, kind: type[Working], waker: Waker) -> Working:
         self.told.append(f"{name} made")
@@ -116,6 +181,11 @@ class RunningSupervisor:
         self.supervisor.submit(job)
         self.supervisor.submit(done.set)
         assert done.wait(limit_s), "the supervisor does not get to it"
+
+    def look(self) -> None:
+        """Return once it has looked at everything anew."""
+        for _ in range(2):  # the first comes in the middle of a look
+            self.do(lambda: None)
 
     def change(self, plans: list[Plan], between: Callable[[], None] = lambda: None) -> None:
         self.do(partial(self.supervisor.change, plans, between))

@@ -27,6 +27,7 @@ WRITE_MOST: Final = 1024  # bytes; a pty says that its characters take no time
 NOISE_MOST: Final = 100  # breaks, NULs and damaged characters in a minute; more are an alarm (section 5)
 NOISE_S: Final = 60.0
 MARK: Final = 0xFF
+ABOUT: Final = {"about": "serial console: noise"}  # one cause, for the log
 
 log = logging.getLogger(__name__)
 
@@ -83,10 +84,10 @@ class Noise:
         is_many = len(self._heard_s) > NOISE_MOST and now_s - self._heard_s[0] <= NOISE_S
         if is_many and not self._is_alarm:
             self._is_alarm = True
-            log.warning("serial console: %s", self.trouble)
+            log.warning("serial console: %s", self.trouble, extra=ABOUT)
         elif self._is_alarm and now_s - self._heard_s[-1] >= NOISE_S:
             self._is_alarm = False
-            log.warning("serial console: the line is quiet again")
+            log.warning("serial console: the line is quiet again", extra=ABOUT)
 
 
 class SerialConsole:
@@ -160,7 +161,7 @@ class SerialConsole:
         self._bytes = MarkedBytes()
         self._session = Session(self._shared, "serial console", Rank.SERIAL, "serial console", self.wake)
         self._session.start()
-        log.info("%s: open", self.name)
+        log.info("%s: open", self.name, extra={"about": self.name})
 
     def _let_go(self) -> None:
         session, self._session = self._session, None

@@ -216,7 +216,7 @@ class ControlClient:
         if word == MENU:
             self._open_menu(rest.split(maxsplit=2))
         elif word in self._door.commands:
-            log.info("control socket: %s", escaped(line))
+            log.debug("control socket: %s", escaped(line))  # a monitor asks for the status all day; a reload says so
             self._run(self._door.commands[word], rest.strip())
         else:
             self._end(f"error: there is no command {escaped(word) or 'without a name'}")
@@ -245,6 +245,6 @@ class ControlClient:
             return
         session.columns = min(max(int(words[0]), COLUMNS_MIN), COLUMNS_MAX)
         session.rows = min(max(int(words[1]), ROWS_MIN), ROWS_MAX)
-        log.info("control socket: %s has come", session.who)
+        log.debug("control socket: %s has come", session.who)
         session.start()
         self._session = session

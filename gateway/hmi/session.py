@@ -232,7 +232,7 @@ class Session:
             return
         self._say(self._login.turn())
         if self._login.is_refused:
-            log.warning("menu: %s is locked out and was closed", self.who)
+            log.debug("menu: %s is locked out and was closed", self.who)  # the lock-out itself was told
             self.end()
         elif self._login.is_done:
             self._login, self._is_known = None, True

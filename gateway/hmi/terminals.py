@@ -425,7 +425,7 @@ class TelnetDoor:
         now_s = self.shared.clock.monotonic()
         if now_s - self._warned_s.get(text, -WARN_AGAIN_S) >= WARN_AGAIN_S:
             self._warned_s[text] = now_s
-            log.warning(text, host)
+            log.warning(text, host, extra={"about": text})  # not the host: there are many
 
 
 def too_many(shared: Shared) -> str:
