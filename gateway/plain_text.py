@@ -8,6 +8,8 @@ from __future__ import annotations
 
 def printable(text: str, kept: str = "") -> str:
     """Return *text* with whatever cannot be printed escaped, but for the characters *kept*."""
+    if text.isprintable():  # as nearly all is
+        return text
     return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)
 
 

@@ -35,6 +35,7 @@ PROGRAMS: Final = {
     "mke2fs": "e2fsprogs",
     "gpgv": "gpgv",
     "xz": "xz-utils",
+    "setpriv": "util-linux",
 }
 BUILD_LIMIT_S: Final = 1800.0
 CALL_LIMIT_S: Final = 60.0

@@ -154,6 +154,7 @@ class Machine:
     def _command(self) -> list[str]:
         files = self._folder
         return [
+            *("setpriv", "--pdeathsig", "KILL"),  # nothing of it is left, however the tests end
             "qemu-system-x86_64",
             *PROCESSOR,
             *("-machine", "pc", "-smp", "1", "-m", str(MEMORY_MIB)),

@@ -25,7 +25,7 @@ from tests import peers
 from tests.changing import section
 from tests.lines import cable
 from tests.system.board.image import HERE, base
-from tests.system.board.machine import Machine, machine
+from tests.system.board.machine import SOON_S, Machine, machine
 
 ROOT: Final = HERE.parents[2]
 CONFIG: Final = "/etc/rtugate/rtugate.toml"
@@ -37,6 +37,7 @@ DEVICE_TIMEOUT_S: Final = 30  # of the hardware; more than TIMEOUT_S + 15
 EVERY_S: Final = 0.5  # a poll
 CONSOLE: Final = 2  # which UART
 ANSWER_S: Final = 5.0  # that mbpoll waits: the board is slow
+START_LIMIT_S: Final = 180.0  # the gateway takes 3 s on an idle machine, 20 s right after a boot on a busy one
 SEVERAL: Final = 5  # polls: no left-over
 ORDER: Final = "/run/faults/order"  # who is to commit which fault: tests.hanging
 
@@ -134,7 +135,7 @@ class Station:
         goals = [(device, device.served + times) for device in (self.meter, self.boiler)]
         return lambda: all(device.served >= goal for device, goal in goals)
 
-    def wait_polling(self, limit_s: float = 120.0) -> float:
+    def wait_polling(self, limit_s: float = START_LIMIT_S) -> float:
         """Return the seconds until both devices are being polled."""
         begun_s = time.monotonic()
         self.board.until(self.is_polling(), "both devices are polled", limit_s)
@@ -173,6 +174,10 @@ class Station:
     def pid(self) -> str:
         return self.show("MainPID")["MainPID"]
 
+    def watchdog_state(self) -> str:
+        """Return what the kernel says of the hardware watchdog: active, inactive."""
+        return self.board.do("cat /sys/class/watchdog/watchdog0/state")
+
     def journal(self) -> str:
         """Return what the service has logged since the machine came up."""
         return self.board.do("journalctl --boot --unit=rtugate.service --output=short-monotonic --no-pager --quiet")
@@ -184,12 +189,12 @@ class Station:
         """What has come to the console since the last key."""
         return self.board.uarts[CONSOLE].came.decode(errors="replace")
 
-    def type(self, keys: str, awaited: str, limit_s: float = 30.0) -> str:
+    def type(self, keys: str, awaited: str) -> str:
         """Type *keys*; return what is shown, once *awaited* is part of it."""
         wire = self.board.uarts[CONSOLE]
         wire.came = b""
         wire.send(keys.encode())
-        self.board.until(lambda: awaited in self.shown, f"{awaited!r} on the console: {self.shown!r}", limit_s)
+        assert self.board.watch(lambda: awaited in self.shown, SOON_S), f"no {awaited!r} on the console: {self.shown!r}"
         return self.shown
 
     # -------------------------------------------------------------------------------------------- what is done to it
@@ -197,7 +202,12 @@ class Station:
     def restart(self) -> None:
         """A clean restart, which forgives all that went wrong before; everything works afterwards."""
         self.board.do("systemctl restart rtugate.service")
+        self.wait_works()
+
+    def wait_works(self) -> None:
+        """Return once both devices are polled and the watchdog is fed."""
         self.wait_polling()
+        self.board.until(lambda: self.watchdog_state() == "active", "the watchdog is opened")
 
     def settle(self) -> None:
         """Undo whatever was done to it; return once everything works."""
