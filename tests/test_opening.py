@@ -72,6 +72,12 @@ def slow(clock: JumpingClock) -> Iterator[Slow]:
     waker.close()
 
 
+def attempt_until_over(opening: Opening[Port], waker: Waker) -> Port:
+    while (port := opening.attempt(threading.Event())) is None:
+        assert waker.wait(PATIENCE_S)
+    return port
+
+
 def an_opening(clock: JumpingClock) -> Opening[Port]:
     return Opening("field", clock, Port, JumpingWaker(clock))
 
@@ -206,6 +212,5 @@ def test_a_bug_in_what_opens_is_raised_where_it_was_asked(clock: JumpingClock) -
     waker = Waker()
     opening = Opening("field", clock, broken, waker, in_thread)
     with pytest.raises(ZeroDivisionError):
-        while opening.attempt(threading.Event()) is None:
-            assert waker.wait(PATIENCE_S)
+        attempt_until_over(opening, waker)
     waker.close()
