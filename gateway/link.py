@@ -19,6 +19,7 @@ import math
 import os
 import select
 import socket
+import struct
 import termios
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -35,6 +36,8 @@ from gateway.errors import LinkError, LinkLost, LinkSettingRefused, LinkUnavaila
 READ_BYTES = 8192
 DISCARD_READS = 256  # a peer that never stops sending must not hold discard() for ever
 ECHO_GRACE_S = 0.1
+CLOSE_LIMIT_S = 1.0  # what takes longer to be sent is not waited for at closing
+PIECE_S = 0.25  # of a wait in a write: each is a sign of life
 SELECT_LIMIT = 1024  # FD_SETSIZE: select() knows no descriptor from here on
 
 _PARITY_MASK = termios.PARENB | termios.PARODD
@@ -78,6 +81,8 @@ class Waker:
     from writing into a descriptor that was closed and given to someone else. One thread can take it twice: a signal
     handler may interrupt a ``wake()`` with its own.
     """
+
+    progress: Callable[[], object] = bool  # told, in the thread that waits, whenever a long write has got on by a piece
 
     def __init__(self) -> None:
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -210,10 +215,19 @@ class DescriptorLink:
                 rest = rest[os.write(self._fd, rest) :]
             except BlockingIOError:
                 remaining_s = deadline - self.clock.monotonic()
-                if remaining_s <= 0 or not wait_ready((), (self._fd,), remaining_s):
+                if not self._pause(remaining_s, (self._fd,)):
                     raise LinkLost(f"{self.name}: does not take data") from None
             except OSError as error:
                 raise self._lost(error) from error
+
+    def _pause(self, seconds: float, writing: Sequence[int] = ()) -> bool:
+        """Wait for one of *writing*, in pieces, each of which is progress; False when the time is over."""
+        until_s = self.clock.monotonic() + seconds
+        while (left_s := until_s - self.clock.monotonic()) > 0:
+            if wait_ready((), writing, min(left_s, PIECE_S)):
+                return True
+            self.waker.progress()
+        return False
 
     def discard(self) -> int:
         """A link found lost here shows at the next read or write."""
@@ -257,12 +271,13 @@ class RtsLink(DescriptorLink):
         try:
             self.switch(True)
             try:
-                wait_ready((), (), self.before_s)
+                self._pause(self.before_s)
                 ends_at = self.clock.monotonic() + len(data) * self.character_s
                 super().write(data)
+                self._pause(ends_at - self.clock.monotonic())  # what is left for the driver is short
                 with contextlib.suppress(termios.error):  # a signal; or a lost port, which shows below
                     termios.tcdrain(self._fd)
-                wait_ready((), (), ends_at - self.clock.monotonic() + self.after_s)
+                self._pause(ends_at - self.clock.monotonic() + self.after_s)
             finally:
                 self.switch(False)
         except OSError as error:
@@ -348,13 +363,23 @@ class _ExclusivePort(serial.Serial):
     Root opens it all the same. The kernel's word lasts until the last holder has closed the port, and so beyond us.
     """
 
+    character_s = 0.0  # on the wire
+
     def open(self) -> None:
         super().open()
         self._tell_kernel(termios.TIOCEXCL)
 
     def close(self) -> None:
         self._tell_kernel(termios.TIOCNXCL)
+        self._drop_unsent()
         super().close()
+
+    def _drop_unsent(self) -> None:
+        """The kernel would wait for it to be sent, up to half a minute; a stop may not (section 7)."""
+        with contextlib.suppress(OSError, termios.error):  # a port that is gone
+            (unsent,) = struct.unpack("i", fcntl.ioctl(self.fileno(), termios.TIOCOUTQ, bytes(4)))
+            if unsent * self.character_s > CLOSE_LIMIT_S:
+                termios.tcflush(self.fileno(), termios.TCOFLUSH)
 
     def _tell_kernel(self, request: int) -> None:
         with contextlib.suppress(OSError):  # a driver without it, or a port that is gone
@@ -382,6 +407,7 @@ def open_serial(settings: SerialSettings, waker: Waker, clock: Clock) -> Link:
     except (OSError, termios.error, ValueError) as error:  # all that pyserial lets out
         port.close()
         raise LinkUnavailable(f"{settings.device}: {plain_reason(error, _PORT_REASONS)}") from error
+    port.character_s = settings.character_s
     shared = (settings.device, port, waker, clock, "is gone (unplugged?)", settings.character_s)
     link = DescriptorLink(*shared)
     if settings.rs485 == "rts":

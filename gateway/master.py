@@ -185,9 +185,7 @@ class Master:
             return True
         line = opened.line
         if not line.is_free or (line.silent_in_s() and not self._is_never_silent()):
-            return self._listen(
-                line
-            )  # nothing is taken before it can be sent at once: a newer value may come meanwhile
+            return self._listen(line)  # what is taken is sent at once: a newer value may come meanwhile
         self._busy_since_s = self._listens_since_s = None
         if self.config.is_tcp:
             line.advance(0.0)  # a device that has hung up after its last reply fails no request
@@ -202,12 +200,12 @@ class Master:
 
         That is time in use, too."""
         began_s = self._clock.monotonic()
-        if self._listens_since_s is None:
-            self._listens_since_s = began_s
+        since_s = self._listens_since_s = (self._listens_since_s or began_s) if line.is_free else None
+        timeout_s = self.config.response_timeout + self.config.delay  # also of the silence after late replies
+        over_by_s = line.late_until_s if since_s is None else since_s + timeout_s
         line.advance(min(line.silent_in_s() or self._wait_limit_s, self._wait_limit_s))
         now_s = self._clock.monotonic()
         self.busy_s += now_s - began_s
-        over_by_s = max(line.late_until_s, self._listens_since_s + self.config.response_timeout + self.config.delay)
         return now_s <= over_by_s + self._wait_limit_s
 
     def _is_never_silent(self) -> bool:
@@ -220,7 +218,8 @@ class Master:
     def _wait_s(self) -> float:
         """How long nothing is due."""
         due_s = [self._clock.monotonic() + self._wait_limit_s]
-        if self.enabled and (self._opened is not None or self._is_resting):
+        may_open = self._is_resting and not self._opening.wait_s()  # while it is being opened, what is due has to wait
+        if self.enabled and (self._opened is not None or may_open):
             due_s.append(self._schedule.next_due_s() or due_s[0])
             if self._offline:
                 due_s.append(self._probes.due_s())
@@ -249,6 +248,7 @@ class Master:
         again = self._schedule.due(self._clock.monotonic()) if self._is_resting else self._scheduled
         self._schedule.at_once(again)  # what was missed meanwhile is no overrun
         self._is_resting = False
+        self._busy_since_s = self._listens_since_s = None
 
     def _is_work_due(self) -> bool:
         is_probe_due = bool(self._offline) and self._clock.monotonic() >= self._probes.due_s()

@@ -253,6 +253,7 @@ class Gateway:
 
     def _leave_safe_mode(self, row: int) -> None:
         if self.safe_mode.end(row):
+            self._good_since_s = self.clock.monotonic()  # what ran until now proves nothing
             log.warning("safe mode is over: all lines run as configured")
 
     def _look_after_safe_mode(self) -> float:

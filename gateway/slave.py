@@ -161,9 +161,10 @@ class SerialSlave:
     def _due_s(self, now_s: float) -> float:
         if self._is_talk:
             return self._heard_s + self._silence_s
+        limit_s = now_s + self._wait_limit_s
         if self._framer.pending:
-            return self._heard_s + self.config.character_timeout_used
-        return now_s + self._wait_limit_s
+            return min(limit_s, self._heard_s + self.config.character_timeout_used)
+        return limit_s
 
     def _answer_burst(self, link: Link) -> None:
         """Answer the last frame that came, if it is for us: an earlier one is too late, others have spoken since."""

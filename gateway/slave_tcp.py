@@ -29,7 +29,7 @@ from gateway.register import DataRegister, Source, SourceKind
 from gateway.serving import STATION_ALONE, Station, count_traffic, frames_in, server_of
 from gateway.traffic import Tap
 
-RECEIVE_MAX: Final = 16384  # bytes taken from a client at once
+RECEIVE_MAX: Final = 2048  # bytes taken from a client at once: a step answers all that all have asked
 NO_DESCRIPTOR_PAUSE_S: Final = 0.5
 UNSENT_MAX: Final = 65536  # bytes a client may leave unread before it is not listened to any more
 OWN_UNITS: Final = frozenset({0, 255})  # on Modbus TCP: "this gateway"

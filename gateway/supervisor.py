@@ -222,6 +222,7 @@ class _Runner:
         self._stop = threading.Event()
         self._told = told
         self._waker = Waker()
+        self._waker.progress = self._alive
         self._thread: threading.Thread | None = None
         self._restart_s: float | None = None
         self._restart_after_s = RESTART_FIRST_S

@@ -26,7 +26,7 @@ from typing import Final, Protocol
 from gateway.clock import Clock, SystemClock
 from gateway.errors import DeviceRefused, LinkLost, ReplyMismatch, RequestInvalid
 from gateway.modbus import pdu
-from gateway.modbus.framing import RTU_MAX, Frame, Framing, reply_framer
+from gateway.modbus.framing import ASCII_MAX, RTU_MAX, Frame, Framing, reply_framer
 from gateway.modbus.pdu import BROADCAST, AnyRequest, ReadRequest, WriteRequest
 
 NO_ERROR: Final = 0
@@ -307,7 +307,8 @@ class Line:
         """When a request that is asked now is over: behind late replies, the wait for silence, and its own time."""
         timing = self._timing
         began_s = max(self._clock.monotonic(), self.late_until_s) + timeout_s + timing.delay_s + timing.silence_s
-        return began_s + timeout_s + timing.turnaround_s + timing.character_timeout_s + 2 * RTU_MAX * timing.character_s
+        ends_s = began_s + timeout_s + timing.turnaround_s + timing.character_timeout_s
+        return ends_s + 2 * ASCII_MAX * timing.character_s
 
     def _silent_s(self) -> float:
         return self._quiet_since_s + self._timing.silence_s + self._timing.delay_s
@@ -429,6 +430,7 @@ class Line:
         self._link.write(data)
         self._tell(True, data)
         self._sent_s = self._quiet_since_s = self._clock.monotonic() + len(data) * self._timing.character_s
+        self.over_by_s = self._latest_s(asked.timeout_s)  # the write may have waited for its last bit
         if self._is_broadcast(asked.unit):
             self._until_s = self._sent_s + self._timing.turnaround_s
             self._pass(Event.SENT_TO_ALL)

@@ -88,9 +88,11 @@ class Obedient(Working):
         super().__init__(name, enabled, waker, told)
         self._orders: deque[tuple[Callable[[Callable[[], None]], object], threading.Event]] = deque()
         self._has_to_leave = False
+        self._has_begun = threading.Event()
 
     def run(self, stop: threading.Event, alive: Callable[[], None]) -> None:
         self.thread = threading.current_thread()
+        self._has_begun.set()
         while not stop.is_set() and not self._has_to_leave:
             self._waker.wait(60.0)
             while self._orders:
@@ -126,6 +128,7 @@ class Obedient(Working):
         assert done.wait(PATIENCE_S), "the task does not obey"
 
     def _wait_for_end(self) -> None:
+        assert self._has_begun.wait(PATIENCE_S)
         assert self.thread is not None
         self.thread.join(PATIENCE_S)
         assert not self.thread.is_alive()

@@ -114,6 +114,7 @@ class SerialConsole:
         self._link: Link | None = None
         self._bytes = MarkedBytes()
         self._session: Session | None = None
+        self._sends_again_s = 0.0  # when what was written last is on the wire, monotonic
 
     @property
     def trouble(self) -> str:
@@ -185,17 +186,17 @@ class SerialConsole:
             self._bytes.faults = 0
         session.receive(typed)
         session.turn()
-        part = bytes(session.output[: self._part(link)])
+        part = bytes(session.output[: self._part(link)]) if self._clock.monotonic() >= self._sends_again_s else b""
         if part:
             link.write(part)
+            self._sends_again_s = self._clock.monotonic() + len(part) * link.character_s
             session.sent(len(part))
         return bool(data or part) or self._waker.wakes > wakes or has_waited
 
     def _wait_s(self, session: Session) -> float:
-        """How long nothing is to be done but listen; 0 while something waits to be written."""
-        due_s = session.due_s()
-        if session.output:
-            return 0.0
+        """How long nothing is to be done but listen. What is written next waits until the last part is on the wire:
+        in the kernel's buffer it could not be stopped by a key."""
+        due_s = self._sends_again_s if session.output else session.due_s()
         left_s = self._wait_limit_s if due_s is None else due_s - self._clock.monotonic()
         return min(self._wait_limit_s, max(0.0, left_s))
 

@@ -170,10 +170,11 @@ class Session:
         if self.is_over:
             return None
         now_s = self._clock.monotonic()
-        due_s = [self._pause_s, self._idle_at_s(), self._login.due_s() if self._login else None]
+        pause_s = None if self._has_more_keys else self._pause_s  # it comes after them
+        due_s = [pause_s, self._idle_at_s(), self._login.due_s() if self._login else None]
         if self._has_more_keys and self._may_take_keys():
             due_s.append(now_s)
-        if self._has_ended_input:
+        if self._has_ended_input and not self._has_more_keys:
             due_s.append(self._typed_s + ENDED_INPUT_S)
         if self.output and self._rank is not Rank.SERIAL:
             due_s.append(self._sent_s + UNREAD_S)
