@@ -186,8 +186,8 @@ def test_half_an_hour_at_100_times_normal_load_with_every_trouble_grows_by_nothi
             time.sleep(WARM_UP_S)  # there is no event: the last good configuration is written meanwhile
             soak = Soak(here)
             watch = Watch(soak.pid)
-            stack.enter_context(beside(watch.look))
-            soak.run()
+            with beside(watch.look):
+                soak.run()
             polls, cpu = soak.polls_a_second(), soak.cpu_share()
         onlooker.end()
         here.station.process.send_signal(signal.SIGTERM)

@@ -34,6 +34,7 @@ SOON_S: Final = 60.0
 LOOK_EVERY_S: Final = 0.05  # nothing tells a test that a simulated device was polled
 UART_IRQS: Final = (4, 3, 5, 7)  # each its own: a PC's third and fourth share those of the first two
 PROCESSOR: Final = ("-accel", "tcg,tb-size=64", "-cpu", "max,-cx16")  # other sizes boot slower; with cx16 Linux dies
+RESETS: Final = ("WATCHDOG", "RESET", "SHUTDOWN")
 KERNEL_WORDS: Final = (
     "console=hvc0 quiet systemd.show_status=no systemd.getty_auto=no systemd.condition-needs-update=no "
     "systemd.journald.forward_to_console=1 systemd.journald.max_level_console=info"
@@ -114,6 +115,11 @@ class Machine:
     def count(self, event: str) -> int:
         """Return how often this has happened to the machine."""
         return sum(event == known.name for known in self.events)
+
+    @property
+    def resets(self) -> list[Event]:
+        """All that has ended a run of the machine, but for the power."""
+        return [event for event in self.events if event.name in RESETS]
 
     # -------------------------------------------------------------------------------------------- power
 
@@ -258,7 +264,7 @@ class Machine:
 
 
 @contextmanager
-def machine(folder: Path, base: Base, parts: Path, ports: Sequence[str] = ("", "", "", "")) -> Iterator[Machine]:
+def a_machine(folder: Path, base: Base, parts: Path, ports: Sequence[str] = ("", "", "", "")) -> Iterator[Machine]:
     """Give a board that is switched on; nothing of it runs afterwards."""
     made = Machine(folder, base, parts, ports)
     try:

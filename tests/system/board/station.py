@@ -25,7 +25,7 @@ from tests import peers
 from tests.changing import section
 from tests.lines import cable
 from tests.system.board.image import HERE, base
-from tests.system.board.machine import SOON_S, Machine, machine
+from tests.system.board.machine import SOON_S, Machine, a_machine
 
 ROOT: Final = HERE.parents[2]
 CONFIG: Final = "/etc/rtugate/rtugate.toml"
@@ -123,8 +123,8 @@ class Station:
     meter:  polled on ttyS0, its 4 holding registers become 0 to 3; boiler: on ttyS3, its 2 become 100 and 101.
     """
 
-    def __init__(self, board: Machine, meter: TimedDevice, boiler: TimedDevice, upper_line: str) -> None:
-        self.board, self.meter, self.boiler = board, meter, boiler
+    def __init__(self, machine: Machine, meter: TimedDevice, boiler: TimedDevice, upper_line: str) -> None:
+        self.machine, self.meter, self.boiler = machine, meter, boiler
         self._upper_line = upper_line
         self._numbers = iter(range(1000, 65000))
 
@@ -138,7 +138,7 @@ class Station:
     def wait_polling(self, limit_s: float = START_LIMIT_S) -> float:
         """Return the seconds until both devices are being polled."""
         begun_s = time.monotonic()
-        self.board.until(self.is_polling(), "both devices are polled", limit_s)
+        self.machine.until(self.is_polling(), "both devices are polled", limit_s)
         return time.monotonic() - begun_s
 
     def ask(self, count: int = 4, unit: int = OUR_UNIT, address: int = 0) -> list[int]:
@@ -155,19 +155,19 @@ class Station:
         self.meter.set(Table.HOLDING_REGISTERS, 0, fresh[:4])
         self.boiler.set(Table.HOLDING_REGISTERS, 107, fresh[4:])
         begun_s = time.monotonic()
-        self.board.until(
+        self.machine.until(
             lambda: self.ask(4, unit) + self.ask(2, unit, 100) == fresh, "the upper master reads what the devices hold"
         )
         return time.monotonic() - begun_s
 
     def status(self) -> dict[str, Any]:
         """Return what `rtugate status --json` says."""
-        told: dict[str, Any] = json.loads(self.board.do("rtugate status --json"))
+        told: dict[str, Any] = json.loads(self.machine.do("rtugate status --json"))
         return told
 
     def show(self, *names: str) -> dict[str, str]:
         """Return what systemd says of the service."""
-        told = self.board.do(f"systemctl show rtugate.service -p {','.join(names)}")
+        told = self.machine.do(f"systemctl show rtugate.service -p {','.join(names)}")
         return dict(line.split("=", 1) for line in told.splitlines())
 
     @property
@@ -176,64 +176,66 @@ class Station:
 
     def watchdog_state(self) -> str:
         """Return what the kernel says of the hardware watchdog: active, inactive."""
-        return self.board.do("cat /sys/class/watchdog/watchdog0/state")
+        return self.machine.do("cat /sys/class/watchdog/watchdog0/state")
 
     def journal(self) -> str:
         """Return what the service has logged since the machine came up."""
-        return self.board.do("journalctl --boot --unit=rtugate.service --output=short-monotonic --no-pager --quiet")
+        return self.machine.do("journalctl --boot --unit=rtugate.service --output=short-monotonic --no-pager --quiet")
 
     # -------------------------------------------------------------------------------------------- the console
 
     @property
     def shown(self) -> str:
         """What has come to the console since the last key."""
-        return self.board.uarts[CONSOLE].came.decode(errors="replace")
+        return self.machine.uarts[CONSOLE].came.decode(errors="replace")
 
     def type(self, keys: str, awaited: str) -> str:
         """Type *keys*; return what is shown, once *awaited* is part of it."""
-        wire = self.board.uarts[CONSOLE]
+        wire = self.machine.uarts[CONSOLE]
         wire.came = b""
         wire.send(keys.encode())
-        assert self.board.watch(lambda: awaited in self.shown, SOON_S), f"no {awaited!r} on the console: {self.shown!r}"
+        assert self.machine.watch(lambda: awaited in self.shown, SOON_S), (
+            f"no {awaited!r} on the console: {self.shown!r}"
+        )
         return self.shown
 
     # -------------------------------------------------------------------------------------------- what is done to it
 
     def restart(self) -> None:
         """A clean restart, which forgives all that went wrong before; everything works afterwards."""
-        self.board.do("systemctl restart rtugate.service")
+        self.machine.do("systemctl restart rtugate.service")
         self.wait_works()
 
     def wait_works(self) -> None:
         """Return once both devices are polled and the watchdog is fed."""
         self.wait_polling()
-        self.board.until(lambda: self.watchdog_state() == "active", "the watchdog is opened")
+        self.machine.until(lambda: self.watchdog_state() == "active", "the watchdog is opened")
 
     def settle(self) -> None:
         """Undo whatever was done to it; return once everything works."""
-        if not self.board.answers():
-            self.board.cut_power()
-            self.board.start()
-        self.board.do(f"rm -rf {DROP_INS} && systemctl daemon-reload")
+        if not self.machine.answers():
+            self.machine.cut_power()
+            self.machine.start()
+        self.machine.do(f"rm -rf {DROP_INS} && systemctl daemon-reload")
         self.configure()
         self.restart()
 
     def configure(self, unit: int = OUR_UNIT) -> None:
         """Write the board's file."""
-        self.board.put(CONFIG, configuration(unit))
-        self.board.do("chown -R rtugate: /etc/rtugate && sync")
+        self.machine.put(CONFIG, configuration(unit))
+        self.machine.do("chown -R rtugate: /etc/rtugate && sync")
 
     def drop_in(self, text: str) -> None:
         """Change the unit, until ``settle`` or until the machine is restarted."""
-        self.board.put(f"{DROP_INS}/test.conf", text)
-        self.board.do("systemctl daemon-reload")
+        self.machine.put(f"{DROP_INS}/test.conf", text)
+        self.machine.do("systemctl daemon-reload")
 
     def fit_faults(self, restart: str) -> None:
         """The service is now the same gateway with faults to order, and systemd restarts it so: "no", "always".
 
         Until ``settle``, or until the machine is reset.
         """
-        self.board.do("mkdir -p /run/faults && chown rtugate: /run/faults")
+        self.machine.do("mkdir -p /run/faults && chown rtugate: /run/faults")
         program = "/usr/bin/python3 -m tests.hanging run"
         paths = "PYTHONPATH=/usr/share/rtugate-faults:/usr/share/rtugate"
         environment = f"Environment={paths} RTUGATE_FAULT={ORDER}"
@@ -242,7 +244,7 @@ class Station:
 
     def commit(self, who: str, kind: str) -> None:
         """Order a fault; whoever it is for commits it before its next step."""
-        self.board.do(f"printf {who}:{kind} >{ORDER}.new && chown rtugate: {ORDER}.new && mv {ORDER}.new {ORDER}")
+        self.machine.do(f"printf {who}:{kind} >{ORDER}.new && chown rtugate: {ORDER}.new && mv {ORDER}.new {ORDER}")
 
 
 def values_of(told: str) -> list[int]:
@@ -266,7 +268,7 @@ def station(folder: Path, delivery: Delivery = SOURCES) -> Iterator[Station]:
         ports = [simulator.add_serial([device], baudrate=BAUD) for device in (meter, boiler)]
         near, far = stack.enter_context(cable())
         wires = (ports[0], near, "", ports[1])
-        board = stack.enter_context(machine(folder / "board", base(delivery.packages), parts, wires))
+        board = stack.enter_context(a_machine(folder / "board", base(delivery.packages), parts, wires))
         board.do(f"mount -o ro /dev/vdb /mnt\n{delivery.script}")
         board.do("cp -r /mnt/faults /usr/share/rtugate-faults")
         made = Station(board, meter, boiler, far)
