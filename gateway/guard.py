@@ -138,7 +138,7 @@ class Guard:
         device = self._device
         trouble = device.trouble if device is not None else ""
         found = [Told(N_("hardware watchdog: {trouble}"), {"trouble": trouble})] if trouble else []
-        text = N_("{name}: ended with an error {count} times; made anew each time")
+        text = N_("{name}: ends with errors, {count} so far; made anew each time")
         return found + [Told(text, {"name": name, "count": n}) for name, n in self._supervisor.crashes.items()]
 
     def device_state(self) -> Told | None:

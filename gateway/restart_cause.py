@@ -17,8 +17,11 @@ short-lived threads, one after the other, since a slow card must neither look li
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import os
+import stat
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -40,7 +43,7 @@ WATCHDOGS: Final = Path("/sys/class/watchdog")
 CARD_RESET: Final = 0x20  # WDIOF_CARDRESET of linux/watchdog.h: this watchdog has reset the machine
 SAFE_AFTER: Final = 3  # bad restarts in a row
 HUNG_LIMIT_S: Final = 2.0
-END_LIMIT_S: Final = 1.0
+END_LIMIT_S: Final = 0.4
 
 FIRST: Final = N_("first start")
 CLEAN: Final = N_("clean stop")
@@ -131,24 +134,12 @@ class LastRun:
         meanwhile: done while the mark is being written; what blocks there does not keep it from the disk.
         """
         run = replace(self._run, hung=_safe(names) or (UNKNOWN,))
-        try:
-            writer = self._write_later(run)
-        except RuntimeError:  # there may be no more threads; a disk that hangs as well is the backstop's
-            self._write(run)
-            meanwhile()
-            return
-        meanwhile()
-        writer.join(HUNG_LIMIT_S)
+        self._write_within(HUNG_LIMIT_S, run, meanwhile)
 
     def end(self, how: str) -> None:
-        """Say that it ends, and *how*."""
-        if self._writer is not None:
-            self._writer.join(END_LIMIT_S)
-            if self._writer.is_alive():
-                self._warn("the disk does not answer")
-                return
-        self._run = replace(self._run, ended=how)
-        self._write(self._run)
+        """Say that it ends, and *how*; within END_LIMIT_S, whatever the disk does."""
+        if not self._write_within(END_LIMIT_S, replace(self._run, ended=how)):
+            self._warn("the disk does not answer")
 
     def _before(self, evidence: Evidence | None) -> _Run | None:
         """Return how the run before this one ended, as its file and the *evidence* have it; None if there was none."""
@@ -172,6 +163,18 @@ class LastRun:
             return Told(WATCHDOG_AFTER_HANG, name)
         return Told(WATCHDOG) if self._was_reset() else Told(POWER)
 
+    def _write_within(self, limit_s: float, run: _Run, meanwhile: Callable[[], None] = lambda: None) -> bool:
+        """Write *run*; False if that is not done when the time is over."""
+        try:
+            writer = self._write_later(run)
+        except RuntimeError:  # there may be no more threads; a disk that hangs as well is the backstop's
+            self._write(run)
+            meanwhile()
+            return True
+        meanwhile()
+        writer.join(limit_s)
+        return not writer.is_alive()
+
     def _write_later(self, run: _Run) -> threading.Thread:
         """Write *run* in a thread of its own, after any other that is still being written."""
         before, self._run = self._writer, run
@@ -187,10 +190,23 @@ class LastRun:
         return writer
 
     def _write(self, run: _Run) -> None:
+        content = json.dumps(asdict(run)).encode()
         try:
-            write_atomically(self._path, json.dumps(asdict(run)).encode())
+            write_atomically(self._path, content)
         except SaveError as error:
             self._warn(str(error))
+            self._write_in_place(content)
+
+    def _write_in_place(self, content: bytes) -> None:
+        """Where the disk is full, the room of the old file is left; what it says would be told of this run."""
+        with contextlib.suppress(OSError):
+            fd = os.open(self._path, os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                if stat.S_ISREG(os.fstat(fd).st_mode):
+                    os.pwrite(fd, content, 0)
+                    os.ftruncate(fd, len(content))
+            finally:
+                os.close(fd)
 
     def _warn(self, why: str) -> None:
         """Once in a run: every later write would fail as well."""

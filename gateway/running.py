@@ -360,7 +360,7 @@ class Gateway:
             return self.file.reload()
         except ConfigError as error:
             log_findings(error)
-            log.error("%s: not reloaded, nothing has changed", self.path.name)
+            log.error("%s: not reloaded, nothing has changed", self.path.name, extra={"is_unlimited": True})
             raise ConfigError([f"not reloaded, nothing has changed: {error.findings[0]}"]) from error
 
     def in_background(self, work: Callable[[], None], told: Callable[[], None]) -> Job:

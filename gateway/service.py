@@ -43,13 +43,14 @@ from gateway.retained import FILE_NAME, RetainedFile
 from gateway.running import Gateway
 from gateway.safe_mode import SafeMode
 from gateway.stacks import FILE_NAME as STACKS
-from gateway.stacks import Backstop, read_evidence
+from gateway.stacks import Backstop, is_in_use, read_evidence
 from gateway.status import status, status_line
 from gateway.systemd import Systemd
 from gateway.wiring import control_plan, terminal_plans
 
 SIGNALS: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 WORK_LIMIT_S: Final = 60.0  # for a save on a slow card, for tasks that are made anew
+STOP_WORK_LIMIT_S: Final = 0.5  # for a save while it is stopped: what is cut off leaves the old file as it was
 SWITCH_INTERVAL_S: Final = 0.0005  # how long a slave's answer may wait for another thread that computes
 
 log = logging.getLogger("gateway")
@@ -63,6 +64,9 @@ def run_service(path: Path, state: Path, control_path: Path) -> int:
     _make_state(state)
     try:
         with _control_listener(control_path) as listen, _bugs_end_it():
+            if is_in_use(state / STACKS):  # by one whose control socket is elsewhere, or was removed
+                log.error("rtugate runs already (state directory %s)", state)
+                return 1
             service = _Service(path, state, clock, ring)
             service.gateway.supervisor.chores.append(limiter.flush_due)
             service.run(listen)
@@ -70,7 +74,6 @@ def run_service(path: Path, state: Path, control_path: Path) -> int:
         log.error("%s", error)
         return 1
     if service.gateway.wants_restart:
-        service.gateway.finish_work(WORK_LIMIT_S)  # a save would be cut off in the middle
         limiter.tell_rest()
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - ourselves, as we were called
     return 0
@@ -90,6 +93,7 @@ class _Service:
     """The gateway, what guards it, and how it ended last."""
 
     def __init__(self, path: Path, state: Path, clock: Clock, ring: LogRing) -> None:
+        self._clock = clock
         self._last_run = LastRun(state)
         beginning = self._last_run.begin(read_evidence(state / STACKS))
         self.gateway = Gateway(ConfigFile(path, state, clock), clock, ring, RetainedFile(state / FILE_NAME))
@@ -109,6 +113,7 @@ class _Service:
         """Run until a signal or the menu ends it. A task that does not end then ends the process."""
         if not self._run(listen):
             self._guard.did_not_stop()
+        self._finish_work(WORK_LIMIT_S if self.gateway.wants_restart else STOP_WORK_LIMIT_S)
         self._guard.close()
         self._last_run.end(BY_MENU if self.gateway.wants_restart else CLEAN)
         log.info("stopped", extra={"is_unlimited": True})
@@ -132,6 +137,14 @@ class _Service:
             log.error("safe mode: %d bad restarts in a row; all lines are in maintenance", count)
         with _signals_heeded(gateway, self._reload):
             return gateway.run()
+
+    def _finish_work(self, limit_s: float) -> None:
+        """Wait for a save that is under way; meanwhile the guard goes on."""
+        done = threading.Event()
+        self.gateway.background.run(done.set)
+        until_s = self._clock.monotonic() + limit_s
+        while (left_s := until_s - self._clock.monotonic()) > 0 and not done.wait(min(left_s, self._guard.tick(), 1.0)):
+            pass
 
     def _adopt(self, config: Config) -> None:
         self._guard.configure(config.watchdog)

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import fcntl
 import logging
 import os
 import re
@@ -188,6 +189,8 @@ class Backstop:
         except OSError as error:
             return self._without_file(error)
         try:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # for ``is_in_use``; it goes with the process
             os.posix_fallocate(fd, 0, RESERVED_BYTES)
             os.lseek(fd, HEADER_BYTES, os.SEEK_SET)
         except OSError as error:
@@ -262,6 +265,23 @@ def read_evidence(path: Path) -> Evidence | None:
     suspects = tuple(islice(dict.fromkeys(names.get(one.ident, UNKNOWN) for one in guilty), SUSPECTS_MOST))
     first_line = cut(printable(dump[0]), LINE_MOST)
     return Evidence(is_hang, first_line, suspects or (UNKNOWN,), (first_line, *_bounded(lines)))
+
+
+def is_in_use(path: Path) -> bool:
+    """Whether the file at *path* is that of a backstop whose process lives."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(fd)
+    return False
 
 
 def start_of(path: Path, most: int) -> bytes | None:

@@ -63,7 +63,9 @@ def _in_a_word(name: str, view: MasterView | SlaveView | None, working: str) -> 
         return f"{name} being started anew"
     if not view.enabled:
         return f"{name} in maintenance"
-    return f"{name} {'has no line' if view.trouble else working}"
+    if view.trouble:
+        return f"{name} has no line"
+    return f"{name} {working if view.ready.is_set() else 'is being opened'}"
 
 
 def _master(station: Station, line: MasterConfig, view: MasterView | None) -> dict[str, Any]:
@@ -121,7 +123,9 @@ def _slave(station: Station, line: SlaveConfig, view: SlaveView | None) -> dict[
         }
         for client in list(view.clients.values())
     ]
-    state = "answering" if view.enabled else "maintenance"
+    state = (
+        "maintenance" if not view.enabled else "answering" if view.ready.is_set() and not view.trouble else "no line"
+    )
     return told | {"state": state, "trouble": view.trouble, **_served(view.counters), "clients": clients}
 
 

@@ -165,8 +165,8 @@ def test_a_timeout_that_the_device_does_not_take_is_shown_as_what_it_is(it: Stil
 def test_tasks_that_end_by_themselves_are_alarms(it: StillBench) -> None:
     it.still.crashed = {"field": 3, "scada": 1}
     assert it.alarms() == [
-        "field: ended with an error 3 times; made anew each time",
-        "scada: ended with an error 1 times; made anew each time",
+        "field: ends with errors, 3 so far; made anew each time",
+        "scada: ends with errors, 1 so far; made anew each time",
     ]
 
 

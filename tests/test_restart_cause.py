@@ -6,6 +6,7 @@ A station here is what ``running`` makes of it: SAFE_AFTER bad restarts in a row
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -514,4 +515,23 @@ def test_an_end_comes_after_what_is_still_being_written_and_is_given_up_where_th
         run.end("clean stop")
         assert CLOCK.monotonic() - began_s < END_LIMIT_S + 0.5
     assert "cannot be kept: the disk does not answer" in caplog.text
-    assert cause(a_run(tmp_path)) == "crash"
+    assert cause(a_run(tmp_path)) == "clean stop"  # late, since this process lives on
+
+
+def test_on_a_full_disk_what_the_old_file_says_is_not_told_of_a_later_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = a_run(tmp_path)
+    run.begin()
+    run.end("clean stop")
+    make = os.open
+
+    def full(path: str | Path, flags: int, mode: int = 0o777) -> int:
+        if flags & os.O_CREAT:
+            raise OSError(errno.ENOSPC, "full")
+        return make(path, flags, mode)
+
+    monkeypatch.setattr(os, "open", full)
+    rows = [LastRun(tmp_path, tmp_path / "boot_id").begin() for _ in range(4)]
+    assert [one.cause.words(str) for one in rows] == ["clean stop", "crash", "crash", "crash"]
+    assert [one.bad_in_row for one in rows] == [0, 1, 2, SAFE_AFTER]

@@ -23,7 +23,7 @@ from tests.config_files import BAD, GOOD, config_of, counting, text_counting
 from tests.hmi.terminals import tcp_client
 from tests.lines import raw_client
 from tests.peers import client_tcp, free_port, unit_kwargs
-from tests.programs import Program, is_listening, program, until
+from tests.programs import SOON_S, STOP_LIMIT_S, Program, is_listening, program, until
 from tests.test_files import NOBODY
 
 PROMPT = "rtugate> "
@@ -37,6 +37,19 @@ SLOW_DISK = """
 import os, sys, time
 flush = os.fsync
 os.fsync = lambda descriptor: (time.sleep(0.5), flush(descriptor))[1]
+from gateway.cli import main
+sys.exit(main())
+"""
+STUCK_DISK = """
+import os, sys, time
+flush = os.fsync
+
+def wait_and_flush(descriptor):
+    while os.path.exists("stuck"):
+        time.sleep(0.01)
+    flush(descriptor)
+
+os.fsync = wait_and_flush
 from gateway.cli import main
 sys.exit(main())
 """
@@ -162,6 +175,27 @@ def test_a_second_gateway_is_refused_with_exit_code_1_and_the_first_goes_on(good
     good.runs.pop()
     assert good.ask("reload") == "reloaded"
     assert good.stop() == 0
+
+
+def test_a_second_gateway_with_another_socket_leaves_the_firsts_state_alone(good: Program) -> None:
+    elsewhere = good.folder / "elsewhere"
+    elsewhere.mkdir()
+    kept = {path: path.read_bytes() for path in good.state.iterdir() if path.is_file()}
+    good.start(environment={"RUNTIME_DIRECTORY": str(elsewhere)})
+    second = good.runs.pop()
+    assert second.wait(SOON_S) == 1
+    assert f"rtugate runs already (state directory {good.state})" in good.said
+    assert {path: path.read_bytes() for path in good.state.iterdir() if path.is_file()} == kept
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_a_disk_that_does_not_answer_holds_up_no_stop(tmp_path: Path) -> None:
+    with program(tmp_path, GOOD) as stuck:
+        stuck.started(["-c", STUCK_DISK])
+        (tmp_path / "stuck").touch()
+        stuck.run.send_signal(signal.SIGTERM)
+        assert stuck.run.wait(STOP_LIMIT_S) == 0
+        assert "why the gateway was started cannot be kept: the disk does not answer" in stuck.said
 
 
 def test_a_control_socket_left_by_a_crash_is_replaced(good: Program) -> None:

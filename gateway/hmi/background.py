@@ -77,7 +77,7 @@ class Background:
 
     def _start(self) -> None:
         try:
-            threading.Thread(target=self._work, name=self._name).start()
+            threading.Thread(target=self._work, name=self._name, daemon=True).start()
         except RuntimeError as error:  # no thread is left: the calls wait, and the next one tries again
             with self._lock:
                 self._is_working = False

@@ -69,6 +69,7 @@ class LineView(Protocol):
     name: str
     enabled: bool
     traffic: Tap
+    ready: threading.Event  # its line is open, or it has been said why not
 
     @property
     def trouble(self) -> str:

@@ -5,6 +5,7 @@ Nothing waits: a key is typed, the masters work until what the menu waits for is
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,6 +56,10 @@ class ASlave:
     counters: ServeCounters = field(default_factory=ServeCounters)
     clients: dict[int, AClient] = field(default_factory=dict)
     trouble: str = ""
+    ready: threading.Event = field(default_factory=threading.Event)
+
+    def __post_init__(self) -> None:
+        self.ready.set()
 
 
 class DeskStation:

@@ -102,7 +102,7 @@ class Unplugging:
 
 
 class HalfOpen:
-    """Clients of a slave, some in the middle of a request, whose machine is switched off: no FIN, no RST."""
+    """Clients of a slave, every other one in the middle of a request, whose machine is switched off: no FIN, no RST."""
 
     def __init__(self, port: int, count: int) -> None:
         self._port, self._count = port, count
@@ -112,7 +112,7 @@ class HalfOpen:
             with connected(self._port) as client:
                 client.sendall(READ)
                 assert client.recv(512)
-                client.sendall(READ[: number % len(READ)])
+                client.sendall(READ[: 7 * (number % 2)])
                 client.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR, 1)
 
     def end(self) -> None:
