@@ -197,11 +197,11 @@ def test_half_an_hour_at_100_times_normal_load_with_every_trouble_grows_by_nothi
     record_property("longest that this test itself was late", f"{1000 * watch.longest_s:.0f} ms")
     people_and_clients_came(here, onlooker, record_property)
     threads_and_descriptors_came_back(soak, watch.samples, record_property)
+    the_watchdog_was_fed(here.watchdog, record_property)
     the_field_was_polled(polls)
     scada_was_served(crowd.seen, record_property)
     memory_is_flat(watch.samples, record_property)
     the_log_is_short(here.station.said, len(soak.back_s), record_property)
-    the_watchdog_was_fed(here.watchdog, record_property)
 
 
 def people_and_clients_came(here: Place, onlooker: Onlooker, record: Record) -> None:
