@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from tests.changing import slave
 from tests.config_files import BAD, GOOD, Place, config_of
 from tests.fakes import JumpingClock
 from tests.gateways import Bench, Live, done, nobody
-from tests.lines import STOP_LIMIT_S
+from tests.lines import PATIENCE_S, STOP_LIMIT_S
 from tests.peers import free_port
 from tests.programs import SOON_S, Program, is_listening, program, until
 
@@ -129,6 +130,15 @@ class Safe:
 
     def pass_s(self, seconds: float) -> None:
         self.clock.pass_s(seconds)
+        looked = threading.Event()
+
+        def look() -> float:  # after the chore that is meant here
+            looked.set()
+            return NEVER_S
+
+        self.gateway.supervisor.chores.append(look)
+        self.gateway.supervisor.submit(nobody)
+        assert looked.wait(PATIENCE_S)
         self.settle()
 
     def told(self) -> list[str]:
