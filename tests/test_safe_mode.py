@@ -256,7 +256,8 @@ def test_a_line_that_crashes_in_safe_mode_is_made_anew_in_maintenance(place: Pla
         task: Any = it.gateway.slave("on")
         task.step = lambda: 1 // 0
         task.wake()
-        until(lambda: it.gateway.supervisor.crashes == {"on": 1})
+        until(lambda: it.gateway.supervisor.failed_s is not None)
+        assert it.gateway.supervisor.crashes == {"on": 1}
         assert it.gateway.slave("on") is None
         it.pass_s(1.0)
         assert it.states() == {"on": False, "off": False}

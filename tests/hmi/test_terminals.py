@@ -59,7 +59,7 @@ class Served:
 
     @contextmanager
     def client(self, source: str = "127.0.0.1") -> Iterator[Client]:
-        self.run.wait_until(self.task.ready.is_set)
+        self.run.wait_until(lambda: self.task.port)
         with tcp_client(self.task.port, source) as client:
             yield client
 
