@@ -39,6 +39,14 @@ _WORDS: Final = {
 }
 
 
+def read_start(path: Path, most: int) -> bytes | None:
+    """Return the regular file at *path*, or its first *most* bytes; None if it is something else. Raises OSError."""
+    if not stat.S_ISREG(path.stat().st_mode):  # a FIFO waits, and a device may act on being opened
+        return None
+    with path.open("rb") as file:
+        return file.read(most)
+
+
 def write_atomically(path: Path, content: bytes, mode_for_new: int = MODE_FOR_NEW) -> None:
     """Replace the file at *path*, or the one that a link there leads to, with *content*; on return it is on the disk.
 

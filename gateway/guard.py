@@ -86,7 +86,7 @@ class Guard:
         if not self._is_ready and self._supervisor.are_ready:
             self._is_ready = True
             self.systemd.ready()
-        self.systemd.status(self.status())
+        self.systemd.status(self.status())  # also where nobody listens: who looks for alarms has slow work logged
         return self.systemd.feed()
 
     def _feed(self, device: WatchdogDevice) -> None:

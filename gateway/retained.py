@@ -24,7 +24,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-import stat
 import struct
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -219,14 +218,13 @@ class RetainedFile:
     def _read(self) -> Snapshot:
         """Raises SaveError; where there is no file there are no values."""
         try:
-            if not stat.S_ISREG(self.path.stat().st_mode):  # a FIFO waits, and a device may act on being opened
-                raise SaveError("it is not a regular file")
-            with self.path.open("rb") as file:
-                content = file.read(LARGEST_FILE + 1)
+            content = files.read_start(self.path, LARGEST_FILE + 1)
         except FileNotFoundError:
             return Snapshot(0, [])
         except OSError as error:
             raise SaveError(files.in_words(error, self.path)) from error
+        if content is None:
+            raise SaveError("it is not a regular file")
         return decode(content)
 
 

@@ -33,7 +33,7 @@ from gateway.retained import RetainedFile
 from gateway.safe_mode import SafeMode
 from gateway.slave import SerialSlave
 from gateway.slave_tcp import TcpSlave
-from gateway.supervisor import Plan, Supervisor
+from gateway.supervisor import TICK_MOST_S, Plan, Supervisor
 from gateway.wiring import Station
 
 NOTICES_KEPT: Final = 5
@@ -164,11 +164,16 @@ class Gateway:
         self.wants_restart = True
         self.supervisor.stop()
 
-    def finish_work(self, limit_s: float) -> bool:
-        """Wait until the saves that were asked for are done; False after *limit_s*."""
+    def finish_work(self, limit_s: float, meanwhile: Callable[[], float] = lambda: TICK_MOST_S) -> bool:
+        """Wait until the saves that were asked for are done; False after *limit_s*.
+
+        meanwhile: done at least once a second while it waits; says after how long to do so again.
+        """
         done = threading.Event()
         self.background.run(done.set)
-        return done.wait(limit_s)
+        while limit_s > 0 and not done.wait(wait_s := min(limit_s, meanwhile(), TICK_MOST_S)):
+            limit_s -= wait_s
+        return done.is_set()
 
     def change(self, old: Config, new: Config, told: Callable[[], None]) -> Job:
         """Have *new* run instead of *old*; raises ConfigError, with every finding, and nothing has changed."""

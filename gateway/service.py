@@ -23,7 +23,6 @@ from typing import Final
 
 from gateway import __version__
 from gateway.clock import Clock, SystemClock
-from gateway.config import Config
 from gateway.config_file import ConfigFile
 from gateway.errors import GatewayError, LinkError
 from gateway.guard import Guard
@@ -93,7 +92,6 @@ class _Service:
     """The gateway, what guards it, and how it ended last."""
 
     def __init__(self, path: Path, state: Path, clock: Clock, ring: LogRing) -> None:
-        self._clock = clock
         self._last_run = LastRun(state)
         beginning = self._last_run.begin(read_evidence(state / STACKS))
         self.gateway = Gateway(ConfigFile(path, state, clock), clock, ring, RetainedFile(state / FILE_NAME))
@@ -113,7 +111,8 @@ class _Service:
         """Run until a signal or the menu ends it. A task that does not end then ends the process."""
         if not self._run(listen):
             self._guard.did_not_stop()
-        self._finish_work(WORK_LIMIT_S if self.gateway.wants_restart else STOP_WORK_LIMIT_S)
+        limit_s = WORK_LIMIT_S if self.gateway.wants_restart else STOP_WORK_LIMIT_S
+        self.gateway.finish_work(limit_s, self._guard.tick)  # a save would be cut off in the middle
         self._guard.close()
         self._last_run.end(BY_MENU if self.gateway.wants_restart else CLEAN)
         log.info("stopped", extra={"is_unlimited": True})
@@ -123,13 +122,13 @@ class _Service:
         shared = shared_of(gateway)
         control = control_plan(shared, listen, {"reload": self._reload_now, "status": partial(status, gateway)})
         gateway.terminal_plans = lambda config: terminal_plans(config, shared, control)
-        gateway.adopted, gateway.guards_alarms = self._adopt, guard.alarms
-        log.setLevel(gateway.config.log.level.upper())
-        gateway.guards_state, guard.has_reset = guard.device_state, self._was_reset
-        guard.status = partial(status_line, gateway)
-        self._adopt(gateway.config)
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        gateway.adopted = lambda config: guard.configure(config.watchdog)
+        gateway.guards_alarms, gateway.guards_state = guard.alarms, guard.device_state
+        guard.status, guard.has_reset = partial(status_line, gateway), self._was_reset
         config = gateway.config
+        gateway.adopted(config)
+        log.setLevel(config.log.level.upper())
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         log.info("rtugate %s runs: %d masters, %d slaves", __version__, len(config.master), len(config.slave))
         log.info("last restart: %s", gateway.last_restart.words(str))
         if gateway.is_safe:
@@ -137,17 +136,6 @@ class _Service:
             log.error("safe mode: %d bad restarts in a row; all lines are in maintenance", count)
         with _signals_heeded(gateway, self._reload):
             return gateway.run()
-
-    def _finish_work(self, limit_s: float) -> None:
-        """Wait for a save that is under way; meanwhile the guard goes on."""
-        done = threading.Event()
-        self.gateway.background.run(done.set)
-        until_s = self._clock.monotonic() + limit_s
-        while (left_s := until_s - self._clock.monotonic()) > 0 and not done.wait(min(left_s, self._guard.tick(), 1.0)):
-            pass
-
-    def _adopt(self, config: Config) -> None:
-        self._guard.configure(config.watchdog)
 
     def _was_reset(self, cause: Told) -> None:
         self.gateway.last_restart = cause

@@ -24,7 +24,6 @@ import fcntl
 import logging
 import os
 import re
-import stat
 import sys
 import sysconfig
 import threading
@@ -35,6 +34,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from gateway.files import read_start
 from gateway.plain_text import cut, printable
 
 FILE_NAME: Final = "stacks.txt"
@@ -287,10 +287,7 @@ def is_in_use(path: Path) -> bool:
 def start_of(path: Path, most: int) -> bytes | None:
     """Return the regular file at *path*, or its first *most* bytes; None where there is none, or it cannot be read."""
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a FIFO waits, and a device may act on being opened
-            return None
-        with path.open("rb") as file:
-            return file.read(most)
+        return read_start(path, most)
     except OSError:
         return None
 
