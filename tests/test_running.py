@@ -219,6 +219,19 @@ def test_whoever_must_not_cut_off_a_save_can_wait_for_it(bench: Bench) -> None:
     assert job.is_done
 
 
+def test_who_waits_for_slow_work_does_something_else_meanwhile(bench: Bench) -> None:
+    times: list[float] = []
+
+    def meanwhile() -> float:
+        times.append(0.01)
+        return 0.01
+
+    with bench.busy():
+        assert not bench.gateway.finish_work(0.045, meanwhile)
+    assert len(times) == 5
+    assert bench.gateway.finish_work(PATIENCE_S)
+
+
 def test_what_goes_wrong_in_the_background_is_the_jobs_problem(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     told = threading.Event()
 
