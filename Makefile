@@ -2,6 +2,8 @@
 # make test   the tests; needs only Python (3.11 or newer, with pip and venv)
 # make check  the tests with coverage, ruff, mypy
 # make translations   the catalogues of the menu, brought up to date with the code
+# make manual  the manual pages, brought up to date with the code
+# make deb     the Debian package, in dist/; needs build-essential, debhelper and dh-python
 # make bench  how fast it is, against a peer in the same run
 # make system-test   what takes minutes; writes tests/system/LAST.md; TESTS="FILE ..." for some of it
 
@@ -14,7 +16,7 @@ PYTEST_ARGS ?=
 BIN = $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
 
-.PHONY: demo test check translations bench system-test clean
+.PHONY: demo test check translations manual deb bench system-test clean
 
 demo: $(VENV)/.test
 	$(BIN)/rtugate demo $(if $(filter-out 0,$(DEMO_SECONDS)),--seconds $(DEMO_SECONDS))
@@ -33,6 +35,12 @@ check: $(VENV)/.check
 
 translations: $(VENV)/.test
 	$(BIN)/python -m tests.hmi.catalogues
+
+manual: $(VENV)/.test
+	$(BIN)/python -m tests.manual
+
+deb:
+	sh packaging/build.sh dist
 
 bench: $(VENV)/.test
 	$(BIN)/python -m bench.run
