@@ -131,7 +131,9 @@ def _add_documents(commands: Any, common: argparse.ArgumentParser) -> None:
 def _common_options(config: str, state: str) -> argparse.ArgumentParser:
     """What belongs to every command, before or behind it, with these defaults; the last one counts."""
     options = argparse.ArgumentParser(add_help=False)
-    options.add_argument("-c", metavar="FILE", dest="config", default=config, help=f"default: {CONFIG_DEFAULT}")
+    options.add_argument(
+        "-c", metavar="FILE", dest="config", default=config, help=f"the configuration; default: {CONFIG_DEFAULT}"
+    )
     options.add_argument(
         "--state",
         metavar="DIR",
