@@ -2,7 +2,7 @@
 # make test   the tests; needs only Python (3.11 or newer, with pip and venv)
 # make check  the tests with coverage, ruff, mypy
 # make translations   the catalogues of the menu, brought up to date with the code
-# make manual  the manual pages, brought up to date with the code
+# make manual  the manual pages and etc/rtugate.toml, brought up to date with the code
 # make deb     the Debian package, in dist/; needs build-essential, debhelper and dh-python
 # make bench  how fast it is, against a peer in the same run
 # make system-test   what takes minutes; writes tests/system/LAST.md; TESTS="FILE ..." for some of it

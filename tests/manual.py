@@ -1,10 +1,13 @@
-"""The manual pages: `make manual` writes ``man/*.1`` and ``man/*.5`` from ``man/*.in`` and from the code.
+"""What is made from the code, to be read: the manual pages and ``etc/rtugate.toml``; `make manual` writes them.
 
-A page's ``.in`` is its text in troff's man macros, written by hand. A line in it that begins with @ stands for what the
-code knows better: the keys of a table with their types, ranges and defaults (from the configuration's models), a
-command with its options (from the parser of the command line), the functions of Modbus, the version. So the pages
-cannot lie about these, and a key or a command without its place in a page is an error here. The same code gives the
-same pages, byte for byte. They are kept in the tree, since Debian 12 has no pydantic that could make them.
+That file is what an installation begins with, and what `rtugate init` writes.
+
+``man/*.1`` and ``man/*.5`` are made from ``man/*.in``. A page's ``.in`` is its text in troff's man macros, written by
+hand. A line in it that begins with @ stands for what the code knows better: the keys of a table with their types,
+ranges and defaults (from the configuration's models), a command with its options (from the parser of the command
+line), the functions of Modbus, the version. So the pages cannot lie about these, and a key or a command without its
+place in a page is an error here. The same code gives the same pages, byte for byte. They are kept in the tree, since
+Debian 12 has no pydantic that could make them.
 
 Source: man(7), groff_man_style(7); specification of rtugate, sections 9 and 10.
 """
@@ -23,7 +26,7 @@ from gateway import __version__
 from gateway.cli import _parser
 from gateway.config import FUNCTION_CODES, SERVED_CODES
 from gateway.config_checks import not_yet
-from gateway.documents import schema
+from gateway.documents import schema, starting_file
 from gateway.modbus.pdu import QUANTITY_LIMITS
 from gateway.store import load
 
@@ -31,6 +34,7 @@ TESTS: Final = Path(__file__).parent
 FOLDER: Final = TESTS.parent / "man"
 EVERY_KEY: Final = TESTS / "data" / "full.toml"
 PAGES: Final = ("rtugate.1", "rtugate.toml.5")
+DEFAULT_FILE: Final = "etc/rtugate.toml"
 COLUMNS: Final = 78  # of the pages' sources
 SAME_AS: Final = {"slave": "master"}  # a table, and one above it on the page that has many of its keys
 COMMON: Final = ("-h", "-c", "--state", "--version")  # options that belong to every command, or to none
@@ -279,16 +283,15 @@ def _demand_all(name: str, shown: Sequence[str]) -> None:
         raise Unfinished(f"{name}.in: missing {missing}, unknown {unknown}, shown {list(shown)}")
 
 
-def update(folder: Path = FOLDER) -> list[str]:
-    """Write all pages anew; return the paths of those that have changed."""
-    changed = []
-    for name in PAGES:
-        path, text = folder / name, page(name, folder)
-        if not path.exists() or path.read_text("ascii") != text:
-            path.write_text(text, "ascii")
-            changed.append(str(path))
-    return changed
+def update(top: Path = FOLDER.parent) -> list[str]:
+    """Write everything below *top* anew; return the paths of what has changed."""
+    folder = top / FOLDER.name
+    made = {folder / name: page(name, folder) for name in PAGES} | {top / DEFAULT_FILE: starting_file()}
+    changed = [path for path, text in made.items() if not path.exists() or path.read_text("ascii") != text]
+    for path in changed:
+        path.write_text(made[path], "ascii")
+    return [str(path) for path in changed]
 
 
 if __name__ == "__main__":
-    print("\n".join(update()) or "the manual pages are up to date")
+    print("\n".join(update()) or "everything is up to date")

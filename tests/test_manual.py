@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from gateway import __version__
+from gateway.documents import starting_file
 from gateway.errors import ConfigError
 from gateway.store import load_text
 from tests import manual
@@ -50,6 +51,10 @@ def examples(text: str) -> list[str]:
 @all_pages
 def test_the_pages_are_up_to_date_with_the_code(name: str) -> None:
     assert (FOLDER / name).read_text("ascii") == page(name), "run `make manual`"
+
+
+def test_the_default_file_is_what_an_installation_begins_with() -> None:
+    assert (FOLDER.parent / manual.DEFAULT_FILE).read_text("ascii") == starting_file(), "run `make manual`"
 
 
 @all_pages
@@ -143,10 +148,13 @@ def test_a_page_without_a_table_or_command_of_the_code_is_refused(
         page(name, folder)
 
 
-def test_pages_that_say_what_they_should_are_not_written_again(tmp_path: Path) -> None:
+def test_what_says_what_it_should_is_not_written_again(tmp_path: Path) -> None:
+    for folder in ("man", "etc"):
+        (tmp_path / folder).mkdir()
     for name in PAGES:
-        folder_with(tmp_path, name, str)
-    assert manual.update(tmp_path) == [str(tmp_path / name) for name in PAGES]
+        shutil.copy(FOLDER / f"{name}.in", tmp_path / "man")
+    written = [str(tmp_path / path) for path in (*(f"man/{name}" for name in PAGES), manual.DEFAULT_FILE)]
+    assert manual.update(tmp_path) == written
     assert manual.update(tmp_path) == []
 
 
