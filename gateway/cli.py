@@ -109,7 +109,9 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--seconds", metavar="N", type=_positive, help="end after N seconds with a verdict (10 is enough)"
     )
-    demo.add_argument("--port", metavar="PORT", type=_port, default=DEMO_PORT, help="where to serve: %(default)s")
+    demo.add_argument(
+        "--port", metavar="PORT", type=_port, default=DEMO_PORT, help="where to serve; telnet is one above: %(default)s"
+    )
     demo.add_argument("--silent", choices=["meter", "boiler", "io"], help="a device that does not answer")
     demo.set_defaults(command=_demo)
     return parser

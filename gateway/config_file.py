@@ -71,7 +71,7 @@ class ConfigFile:
         self._history = History(state / HISTORY)
         self._marker = Snapshot(state, UNCONFIRMED)
         self._known = _Known()
-        self._alarm: Told | None = None  # how the start went
+        self._alarm: Told | None = None  # how the start went, or the last reload
         self._trouble = ""  # why the file cannot be read or written
 
     @property
@@ -168,6 +168,11 @@ class ConfigFile:
             waits = None
         self._adopt(loaded, waits)
         return loaded.config
+
+    def refused(self) -> None:
+        """The file as it is now cannot be used: an alarm, since the next start will not find what runs in it."""
+        if self._known.loaded is not None:  # else there is such an alarm already
+            self._alarm = self._told(N_("{file} was edited and cannot be used (L shows why): what ran before goes on"))
 
     def _adopt(self, loaded: Loaded, waits: _Unconfirmed | None = None) -> None:
         self._known = _Known(loaded.text.encode(), loaded, waits)

@@ -87,13 +87,14 @@ class Opening(Generic[T]):
                 ready.set()
             return None
         self._call, self._due_s = None, self._clock.monotonic()
-        ready.set()
         try:
             return call.take()
         except LinkError as error:
             if not self._waker.ended:  # else it was interrupted
                 failed(str(error))
             return None
+        finally:
+            ready.set()
 
     def failed(self, reason: str) -> bool:
         """Say so once, and wait longer each time. Returns True the first time since the line worked."""

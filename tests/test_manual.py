@@ -1,8 +1,15 @@
-"""The manual pages are what the code says, read well at 80 columns, and hold examples that work; see ``manual``."""
+"""The manual pages are what the code says, read well at 80 columns, and hold examples that work; see ``manual``.
+
+README.Debian, which goes on where they end, is held to the same.
+"""
 
 from __future__ import annotations
 
+import ast
+import errno
+import os
 import re
+import shlex
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -10,9 +17,13 @@ from pathlib import Path
 
 import pytest
 
-from gateway import __version__
-from gateway.documents import starting_file
+from gateway import __version__, cli, restart_cause, service, snapshots, stacks
+from gateway.config import WatchdogConfig
+from gateway.config_file import HISTORY
+from gateway.documents import SCHEMA_NAME, starting_file
 from gateway.errors import ConfigError
+from gateway.hmi.access import hash_password
+from gateway.retained import FILE_NAME as RETAINED
 from gateway.store import load_text
 from tests import manual
 from tests.manual import FOLDER, PAGES, Unfinished, commands, keys_of, own_arguments, page, table_paths
@@ -21,6 +32,11 @@ COLUMNS = 80
 all_pages = pytest.mark.parametrize("name", PAGES)
 TOML = (FOLDER / "rtugate.toml.5").read_text("ascii")
 COMMAND = (FOLDER / "rtugate.1").read_text("ascii")
+ROOT = FOLDER.parent
+README_DEBIAN = (ROOT / "packaging" / "debian" / "README.Debian").read_text("ascii")
+UNIT = (ROOT / "etc" / "rtugate.service").read_text()
+DEBHELPER_COMPRESSES = 4096  # bytes, and more: dh_compress(1)
+CAUSES = ("FIRST", "CLEAN", "BY_MENU", "CRASH", "POWER", "HANG", "WATCHDOG", "WATCHDOG_AFTER_HANG")
 
 
 def needs(program: str) -> pytest.MarkDecorator:
@@ -225,3 +241,131 @@ def test_a_mistake_is_told_as_the_page_shows_it() -> None:
     with pytest.raises(ConfigError) as refused:
         load_text(text, "rtugate.toml")
     assert [str(one) for one in refused.value.findings] == [shown]
+
+
+# ------------------------------------------------------------------------------------------------ what a page lists
+
+
+def below(heading: str, text: str = COMMAND) -> str:
+    """What stands below a heading (.SH or .SS), up to the next one."""
+    (found,) = re.findall(rf'^\.S[HS] "?{heading}"?\n(.*?)(?=^\.S[HS] |\Z)', text, re.DOTALL | re.MULTILINE)
+    return str(found)
+
+
+def tags(section: str) -> list[str]:
+    """The tags of a section's paragraphs, as a reader sees them."""
+    found = re.findall(r"^\.TP\n\.([BIR]+) (.*)$", section, re.MULTILINE)
+    joined = [(" " if len(macro) == 1 else "").join(shlex.split(re.sub(r"\\f.", "", rest))) for macro, rest in found]
+    return [tag.replace("\\", "") for tag in joined]
+
+
+def said_by_the_program() -> str:
+    """All texts in the modules, but for docstrings, a line each."""
+    said = []
+    for path in sorted((ROOT / "gateway").rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        texts = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in docstrings)
+        said += [node.value for node in texts if isinstance(node.value, str)]
+    return "\n".join(said)
+
+
+def test_every_alarm_that_is_explained_is_said_by_the_program_or_the_system() -> None:
+    said = said_by_the_program() + "".join(
+        os.strerror(code).lower() for code in (errno.ECONNREFUSED, errno.ENETUNREACH)
+    )
+    explained = [re.sub(r" \d+$", "", one) for tag in tags(below("Alarms")) for one in tag.split(", ")]
+    assert len(explained) > 15
+    assert [one for one in explained if one not in said] == []
+
+
+def test_every_cause_of_a_restart_is_explained_and_no_other() -> None:
+    explained = [one for tag in tags(below("Why it was started last")) for one in tag.split(", ")]
+    causes = {str(getattr(restart_cause, name)).format(name="NAME") for name in CAUSES}
+    assert len(causes) == len(CAUSES)
+    assert sorted(explained) == sorted(causes)
+
+
+def test_every_file_that_the_gateway_keeps_is_named_with_its_place() -> None:
+    config, state = Path(cli.CONFIG_DEFAULT), Path(cli.STATE_DEFAULT)
+    names = (HISTORY, snapshots.LAST_GOOD, snapshots.UNCONFIRMED, RETAINED, restart_cause.FILE, stacks.FILE_NAME)
+    places = [config, config.parent / SCHEMA_NAME, *(state / name for name in names), Path("/run/rtugate/control")]
+    beside = ", ".join(f"{at}-DATE" for at in (config.with_name("rtugate.toml.rejected"), "rtugate.toml.replaced"))
+    assert sorted(tag.rstrip("/") for tag in tags(below("FILES"))) == sorted([*map(str, places), beside])
+
+
+def test_every_signal_and_every_variable_that_is_heeded_is_named() -> None:
+    signals = {name for tag in tags(below("SIGNALS")) for name in tag.split(", ")}
+    assert signals == {number.name for number in service.SIGNALS}
+    read = "".join(path.read_text() for path in (ROOT / "gateway").rglob("*.py"))
+    variables = set(re.findall(r'environ\.get\("([A-Z_]+)"', read))
+    assert variables == {name for tag in tags(below("ENVIRONMENT")) for name in tag.split(", ")}
+
+
+def test_readme_debian_is_named_everywhere_as_it_is_installed() -> None:
+    assert len(README_DEBIAN) > DEBHELPER_COMPRESSES
+    paths = re.findall(r"/usr/share/doc/[^\s`]+", COMMAND + TOML + UNIT + (ROOT / "README.md").read_text())
+    assert paths == 3 * ["/usr/share/doc/rtugate/README.Debian.gz"]
+
+
+# ------------------------------------------------------------------------------------------------ README.Debian
+
+
+def blocks() -> list[str]:
+    """What stands indented in README.Debian, without its margin; an empty line ends a block."""
+    found = re.findall(r"(?:^ {4,}\S.*\n)+", README_DEBIAN, re.MULTILINE)
+    return [re.sub(r"(?m)^ {4,6}(?! )", "", block) for block in found]
+
+
+def in_the_file() -> list[str]:
+    """The blocks that are tables of rtugate.toml; those of systemd begin with a capital letter."""
+    return [block for block in blocks() if re.match(r"\[[a-z]", block)]
+
+
+def test_what_readme_debian_puts_into_the_file_can_be_used() -> None:
+    tables = in_the_file()
+    assert len(tables) == 2
+    password = f'[hmi]\npassword = "{hash_password("12345678")}"\n'
+    line = next(block for block in blocks() if block.startswith('line = "/dev/serial/by-id'))
+    master = f'[[master]]\nname = "field"\n{line}'
+    assert load_text("\n".join([password, *tables, master]), "rtugate.toml").findings == []
+
+
+def test_telnet_is_opened_by_changing_the_line_that_readme_debian_names() -> None:
+    (new,) = (block for block in blocks() if block.startswith("listen"))
+    text, count = re.subn(r"(?m)^#listen .*\n", new, starting_file())
+    assert count == 1
+    text = re.sub(r"(?m)^#password = .*$", f'password = "{hash_password("12345678")}"', text, count=1)
+    assert load_text(text, "rtugate.toml").config.hmi.telnet.listen == "0.0.0.0:23"
+
+
+def test_the_commands_in_readme_debian_are_commands() -> None:
+    typed = "\n".join(blocks()) + "\n".join(re.findall(r"`([^`]+)`", README_DEBIAN))
+    used = set(re.findall(r"(?m)(?:^|sudo )rtugate\s([a-z]+)", typed))
+    assert len(used) > 5
+    assert used <= set(commands())
+
+
+def test_readme_debian_fits_80_columns_and_has_the_sections_that_it_lists() -> None:
+    lines = README_DEBIAN.splitlines()
+    assert [line for line in lines if len(line) > COLUMNS] == []
+    listed = dict(re.findall(r"(\d)\. (\S.*?)(?:  |$)", README_DEBIAN.partition("\n\n\n")[0], re.MULTILINE))
+    assert dict(re.findall(r"(?m)^(\d)\. (.*)\n-+$", README_DEBIAN)) == listed
+    assert len(listed) > 5
+
+
+def test_the_time_that_systemd_waits_is_told_as_it_is() -> None:
+    (watchdog_s,) = re.findall(r"(?m)^WatchdogSec=(\d+)$", UNIT)
+    told, example = re.findall(r"WatchdogSec=(\d+)", README_DEBIAN)
+    assert (told, example) == (watchdog_s, "30")
+    assert f"({watchdog_s} s in the service of the Debian package)" in TOML
+    assert f"higher than {WatchdogConfig().timeout:.0f}" in README_DEBIAN
+    assert f"higher than {WatchdogConfig().timeout:.0f}" in TOML
+
+
+def test_what_readme_debian_says_the_service_does_not_see_is_what_the_unit_hides() -> None:
+    (hidden,) = re.findall(r"(?m)^InaccessiblePaths=(.*)$", UNIT)
+    (told,) = re.findall(r"may be a link, but not into (.*?), which", README_DEBIAN, re.DOTALL)
+    paths = re.split(r",\s+|\s+or\s+", told)
+    assert "\nProtectHome=yes\n" in UNIT  # /home, /root and /run/user
+    assert sorted(paths) == sorted(["/home", "/root", *hidden.replace("-/", "/").split()])

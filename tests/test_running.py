@@ -446,6 +446,27 @@ def test_a_reload_of_a_bad_file_changes_nothing_and_logs_everything(
     assert "rtugate.toml:12: " in caplog.text
 
 
+def test_a_file_that_a_reload_refused_is_an_alarm_until_it_is_mended(bench: Bench) -> None:
+    before = bench.place.path.read_text()
+    bench.place.path.write_text(BAD)
+    for _ in range(2):
+        assert done(bench.gateway.reload()).problem
+    told = [alarm.words(str) for alarm in bench.gateway.alarms()]
+    assert told == ["rtugate.toml was edited and cannot be used (L shows why): what ran before goes on"]
+    bench.place.path.write_text(before)
+    bench.gateway.reload()
+    bench.finish()
+    assert bench.gateway.alarms() == []
+
+
+def test_where_factory_settings_run_a_file_that_is_still_bad_is_the_same_alarm(place: Place) -> None:
+    place.path.write_text(BAD)
+    bench = Bench(place)
+    before = bench.gateway.alarms()
+    assert done(bench.gateway.reload()).problem
+    assert bench.gateway.alarms() == before != []
+
+
 def test_on_a_fallback_a_reload_of_the_mended_file_drops_nothing(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:

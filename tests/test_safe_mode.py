@@ -301,6 +301,11 @@ def stopped(gateway: Program) -> int:
     return gateway.run.wait(SOON_S)
 
 
+def states(gateway: Program) -> list[str]:
+    told = status(gateway)
+    return [line["state"] for line in told["slaves"] + told["masters"]]
+
+
 def last_run_of(gateway: Program) -> dict[str, Any]:
     found = json.loads((gateway.state / FILE).read_text())
     assert isinstance(found, dict)
@@ -327,7 +332,7 @@ def test_three_kills_in_a_row_are_safe_mode_and_g_ends_it(tmp_path: Path) -> Non
         gateway.started()
         told = status(gateway)
         assert (told["safe_mode"], told["alarms"]) == (True, [ALARM])
-        assert [line["state"] for line in told["slaves"] + told["masters"]] == ["maintenance"] * 2
+        until(lambda: states(gateway) == ["maintenance"] * 2)  # the control socket is there before they are
         assert json.loads(gateway.command("status", "--json")[1])["safe_mode"] is True
         assert f"ERROR {ALARM}" in gateway.said
         assert not is_listening(port)
