@@ -15,7 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, TextIO
+from typing import Any, Final, TextIO, TypeVar
 
 from gateway import __version__
 from gateway.clock import SystemClock
@@ -31,6 +31,8 @@ DEMO_PORT: Final = 5020
 READABLE: Final = 0o644  # mode of a file without secrets
 SIGNALS: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 SWITCH_INTERVAL_S: Final = 0.0005  # how long a slave's answer may wait for another thread that computes
+
+N = TypeVar("N", int, float)
 
 log = logging.getLogger("gateway")
 
@@ -99,18 +101,20 @@ def _parser() -> argparse.ArgumentParser:
     history = commands.add_parser("history", parents=[common], help="the configurations that were saved last")
     history.set_defaults(command=_history)
     rollback = commands.add_parser("rollback", parents=[common], help="go back to one of them, and have it run")
-    rollback.add_argument("number", metavar="N", type=_positive_integer, help="its number in `rtugate history`")
+    rollback.add_argument("number", metavar="N", type=_version_number, help="its number in `rtugate history`")
     rollback.set_defaults(command=_rollback)
     check = commands.add_parser("check", parents=[common], help="validate a configuration, show each line's load")
     check.add_argument("file", metavar="FILE", nargs="?", help="instead of -c FILE")
     check.set_defaults(command=_check)
     _add_documents(commands, common)
     demo = commands.add_parser("demo", parents=[common], help="simulated devices and the gateway; needs no hardware")
+    demo.add_argument("--seconds", metavar="N", type=_seconds, help="end after N seconds with a verdict (10 is enough)")
     demo.add_argument(
-        "--seconds", metavar="N", type=_positive, help="end after N seconds with a verdict (10 is enough)"
-    )
-    demo.add_argument(
-        "--port", metavar="PORT", type=_port, default=DEMO_PORT, help="where to serve; telnet is one above: %(default)s"
+        "--port",
+        metavar="PORT",
+        type=_demo_port,
+        default=DEMO_PORT,
+        help="where to serve; telnet is one above: %(default)s",
     )
     demo.add_argument("--silent", choices=["meter", "boiler", "io"], help="a device that does not answer")
     demo.set_defaults(command=_demo)
@@ -145,25 +149,25 @@ def _common_options(config: str, state: str) -> argparse.ArgumentParser:
     return options
 
 
-def _positive(text: str) -> float:
-    seconds = float(text)
-    if not 0 < seconds < 1e9:
-        raise ValueError(text)
-    return seconds
+def _within(kind: Callable[[str], N], least: N, most: N, wanted: str) -> Callable[[str], N]:
+    """Return what reads an argument; *wanted*: what it has to be, for people."""
+
+    def read(text: str) -> N:
+        number: N | None
+        try:
+            number = kind(text)
+        except ValueError:
+            number = None
+        if number is None or not least <= number <= most:  # nan is neither
+            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
+        return number
+
+    return read
 
 
-def _positive_integer(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise ValueError(text)
-    return number
-
-
-def _port(text: str) -> int:
-    port = int(text)
-    if not 1 <= port <= 65535:
-        raise ValueError(text)
-    return port
+_seconds = _within(float, 0.001, 1e9, "a number of seconds above 0")
+_version_number = _within(int, 1, sys.maxsize, "a number that `rtugate history` shows")
+_demo_port = _within(int, 1, 65534, "a port from 1 to 65534")
 
 
 # ------------------------------------------------------------------------------------------------ run

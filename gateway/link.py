@@ -47,7 +47,8 @@ _STOP_BITS = {1: 0, 2: termios.CSTOPB}
 
 _PORT_REASONS = {
     **dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV), "is not there"),
-    **dict.fromkeys((errno.EACCES, errno.EPERM), "permission denied; add the user to group dialout"),
+    errno.EACCES: "permission denied; add the user to group dialout",
+    errno.EPERM: "not permitted: the service's unit has no DeviceAllow= for it",
     **dict.fromkeys((errno.EAGAIN, errno.EBUSY), "is used by another program"),  # EAGAIN: the lock
     **dict.fromkeys((errno.ENOTTY, errno.EISDIR), "is no serial port"),
     errno.EIO: "no serial hardware answers there",

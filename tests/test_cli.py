@@ -336,6 +336,18 @@ def test_wrong_usage_is_exit_code_2(arguments: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("rollback", "0"), "argument N: '0' is not a number that `rtugate history` shows"),
+        (("demo", "--seconds", "nan"), "argument --seconds: 'nan' is not a number of seconds above 0"),
+        (("demo", "--port", "65535"), "argument --port: '65535' is not a port from 1 to 65534"),  # telnet is one above
+    ],
+)
+def test_a_number_that_is_none_is_told_in_words(arguments: tuple[str, ...], told: str) -> None:
+    assert rtugate(*arguments).stderr.splitlines()[-1].endswith(told)
+
+
+@pytest.mark.parametrize(
     "arguments",
     [
         ("-c", "{}", "check"),
