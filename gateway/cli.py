@@ -7,6 +7,7 @@ is not there is wrong usage; one that is there and cannot be used is an answer: 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import logging
 import os
@@ -18,17 +19,15 @@ from pathlib import Path
 from typing import Any, Final, TextIO, TypeVar
 
 from gateway import __version__
-from gateway.clock import SystemClock
 from gateway.config import MasterConfig
-from gateway.config_fields import escaped
-from gateway.errors import ConfigError, GatewayError, SaveError
+from gateway.errors import ConfigError, GatewayError
 from gateway.line_load import line_load
-from gateway.store import NAME_CHARACTERS, Loaded, load, read
+from gateway.plain_text import printable
+from gateway.store import Loaded, load, shown
 
 CONFIG_DEFAULT: Final = "/etc/rtugate/rtugate.toml"
 STATE_DEFAULT: Final = "/var/lib/rtugate"
 DEMO_PORT: Final = 5020
-READABLE: Final = 0o644  # mode of a file without secrets
 SIGNALS: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 SWITCH_INTERVAL_S: Final = 0.0005  # how long a slave's answer may wait for another thread that computes
 
@@ -214,68 +213,40 @@ def _passwd(parsed: argparse.Namespace) -> int:
     path = Path(parsed.config)
     if _is_missing(path):
         return _no_such_file(path)
-    return _tell(lambda: set_password(path, _control_path(parsed)))
+    return _tell(lambda: set_password(path, _control_path(parsed)), path.parent)
 
 
 def _history(parsed: argparse.Namespace) -> int:
     from gateway.edits import history
 
-    return _tell(lambda: history(Path(parsed.state)))
+    return _tell(lambda: history(Path(parsed.state)), Path(parsed.state))
 
 
 def _rollback(parsed: argparse.Namespace) -> int:
     from gateway.edits import rollback
 
-    return _tell(lambda: rollback(Path(parsed.config), Path(parsed.state), _control_path(parsed), parsed.number))
+    path, state = Path(parsed.config), Path(parsed.state)
+    return _tell(lambda: rollback(path, state, _control_path(parsed), parsed.number), path.parent)
 
 
 def _init(parsed: argparse.Namespace) -> int:
-    return _tell(lambda: _start_file(_file_of(parsed), parsed.force))
+    from gateway.edits import start_file
+
+    path = _file_of(parsed)
+    return _tell(lambda: start_file(path, parsed.force), path.parent)
 
 
-def _start_file(path: Path, is_forced: bool) -> list[str]:
-    """Write a file to start from, and its schema beside it; return what to tell. Raises GatewayError."""
-    from gateway import documents, files, save
-
-    content = _content(path)
-    text, schema = documents.starting_file().encode(), path.with_name(documents.SCHEMA_NAME)
-    if path == schema:
-        raise SaveError(f"rtugate: {_shown(path)}: the schema is called so: take another name")
-    if content is not None and not is_forced:
-        raise SaveError(
-            f"rtugate: {_shown(path)}: this file exists: --force keeps it under another name and writes a new one"
-        )
-    kept = "" if content in (None, text) else save.keep_beside(path, "replaced", SystemClock().wall()).name
-    files.write_atomically(schema, documents.schema_text().encode(), READABLE)
-    files.write_atomically(path, text)
-    return [
-        f"{_shown(path)}: written" + (f"; what was there is now {escaped(kept, NAME_CHARACTERS)}" if kept else ""),
-        f"{_shown(schema)}: written; editors (VS Code with Even Better TOML) explain and check each key by it",
-        "edit the file, then `rtugate check` says what is wrong with it",
-    ]
-
-
-def _content(path: Path) -> bytes | None:
-    """What the file at *path* says, None where there is none. Raises GatewayError, also for what is no file."""
-    from gateway.files import in_words
+def _tell(work: Callable[[], list[str]], folder: Path | None = None) -> int:
+    """Print what *work* has to tell; 1 where it cannot be done. *folder*: whose owner does it, and not root."""
+    from gateway.files import as_owner_of
 
     try:
-        return read(path)
-    except FileNotFoundError as error:
-        if not path.parent.is_dir():
-            raise SaveError(f"rtugate: {_shown(path)}: its folder does not exist") from error
-        return None
-    except OSError as error:
-        raise SaveError(f"rtugate: {_shown(path)}: {in_words(error, path)}") from error
-
-
-def _tell(work: Callable[[], list[str]]) -> int:
-    """Print what *work* has to tell; 1 where it cannot be done."""
-    try:
-        for line in work():
-            print(line)
+        with as_owner_of(folder) if folder else contextlib.nullcontext():
+            told = work()
+        for line in told:
+            print(printable(line, "\n"))  # a gateway that has been broken into must not speak to root's terminal
     except GatewayError as error:
-        _complain(*str(error).splitlines())
+        _complain(*(printable(line) for line in str(error).splitlines()))
         return 1
     return 0
 
@@ -323,7 +294,7 @@ def _check(parsed: argparse.Namespace) -> int:
     except ConfigError as error:
         _complain(*error.findings)
         return 1
-    print(f"{_shown(path)}: valid")
+    print(f"{shown(path)}: valid")
     _print_loads(loaded)
     return 0
 
@@ -373,9 +344,5 @@ def _is_missing(path: Path) -> bool:
 
 
 def _no_such_file(path: Path) -> int:
-    _complain(f"rtugate: {_shown(path)}: no such file")
+    _complain(f"rtugate: {shown(path)}: no such file")
     return 2
-
-
-def _shown(path: Path) -> str:
-    return escaped(str(path), NAME_CHARACTERS)

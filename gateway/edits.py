@@ -14,17 +14,19 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+from gateway import documents
 from gateway.clock import SystemClock
 from gateway.config import Config
 from gateway.config_file import HISTORY
-from gateway.errors import ConfigError, GatewayError
-from gateway.files import in_words
+from gateway.errors import ConfigError, GatewayError, SaveError
+from gateway.files import in_words, write_atomically
 from gateway.history import History
 from gateway.hmi.access import hash_password, password_problem
 from gateway.save import keep_beside, loaded_with, save, text_for
-from gateway.store import Loaded, load, load_text, read
+from gateway.store import Loaded, load, load_text, read, shown
 
 PASSWORD: Final = ("hmi", "password")
+READABLE: Final = 0o644  # mode of a file without secrets
 NO_HASH_YET: Final = "scrypt$"  # what passes for one until there is one
 ANSWER_LIMIT_S: Final = 65.0
 ABSENT: Final = (FileNotFoundError, NotADirectoryError, ConnectionRefusedError)
@@ -102,6 +104,38 @@ def _keep_present(path: Path, content: bytes, history: History) -> tuple[str | N
         kept = keep_beside(path, "rejected", SystemClock().wall())
         return None, f"what was there cannot be used and is kept as {kept.name}"
     return text, history.keep(text)
+
+
+def start_file(path: Path, is_forced: bool) -> list[str]:
+    """Write a file to start from, and its schema beside it; return what to tell. Raises GatewayError."""
+    before, schema = _content_if_any(path), path.with_name(documents.SCHEMA_NAME)
+    text = documents.starting_file().encode()
+    if path == schema:
+        raise SaveError(f"rtugate: {shown(path)}: the schema is called so: take another name")
+    if before is not None and not is_forced:
+        raise SaveError(
+            f"rtugate: {shown(path)}: this file exists: --force keeps it under another name and writes a new one"
+        )
+    kept = None if before in (None, text) else keep_beside(path, "replaced", SystemClock().wall())
+    write_atomically(schema, documents.schema_text().encode(), READABLE)
+    write_atomically(path, text)
+    return [
+        f"{shown(path)}: written" + (f"; what was there is now {shown(Path(kept.name))}" if kept else ""),
+        f"{shown(schema)}: written; editors (VS Code with Even Better TOML) explain and check each key by it",
+        "edit the file, then `rtugate check` says what is wrong with it",
+    ]
+
+
+def _content_if_any(path: Path) -> bytes | None:
+    """What the file at *path* says, None where there is none. Raises GatewayError, also for what is no file."""
+    try:
+        return read(path)
+    except FileNotFoundError as error:
+        if not path.parent.is_dir():
+            raise SaveError(f"rtugate: {shown(path)}: its folder does not exist") from error
+        return None
+    except OSError as error:
+        raise SaveError(f"rtugate: {shown(path)}: {in_words(error, path)}") from error
 
 
 def _asked_password() -> str:

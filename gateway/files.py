@@ -19,6 +19,7 @@ import re
 import secrets
 import shlex
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -45,6 +46,32 @@ def read_start(path: Path, most: int) -> bytes | None:
         return None
     with path.open("rb") as file:
         return file.read(most)
+
+
+@contextlib.contextmanager
+def as_owner_of(folder: Path) -> Iterator[None]:
+    """Where root works in the *folder* of another user, do it with that user's rights. Main thread alone.
+
+    Whoever may write in a folder may lay links there: root must neither show, keep nor replace what these lead to.
+    """
+    try:
+        status = folder.stat()
+    except OSError:  # whoever needs the folder says what is wrong with it
+        yield
+        return
+    if os.geteuid() != 0 or status.st_uid == 0:
+        yield
+        return
+    groups, group = os.getgroups(), os.getegid()
+    os.setgroups([])
+    os.setegid(status.st_gid)
+    os.seteuid(status.st_uid)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+        os.setegid(group)
+        os.setgroups(groups)
 
 
 def write_atomically(path: Path, content: bytes, mode_for_new: int = MODE_FOR_NEW) -> None:
@@ -167,7 +194,7 @@ def _remove_unless_locked(path: Path) -> None:
 def in_words(error: OSError, path: Path) -> str:
     """What *error*, met at the file *path*, means to a person, and which command helps."""
     if error.errno in (errno.EACCES, errno.EPERM):
-        command = _remedy(path.absolute())
+        command = _remedy(Path(os.path.realpath(path)))  # nobody is to hand over unseen what a link leads to
         return "permission denied" + (f"; what helps, typed as root: {escaped(command, 1000)}" if command else "")
     return _WORDS.get(error.errno or 0) or str(error.strerror or error)
 

@@ -28,7 +28,6 @@ LARGEST_FILE_BYTES: Final = 1024 * 1024
 BYTE_ORDER_MARK: Final = "\ufeff"
 NAME_CHARACTERS: Final = 255  # of a file that are shown
 
-
 _TOML_PLACE: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _DECIMAL: Final = re.compile(r"\+?[0-9][0-9_]*")
 _LONG_NUMBER: Final = re.compile(r"[0-9][0-9_]{4300}")
@@ -215,3 +214,8 @@ def _entry_name(path: config_fields.Path, data: Mapping[str, Any]) -> str:
     kind, index = path[-2:]
     is_sound = isinstance(name, str) and config_fields.is_name(name)
     return f'{kind} "{name}"' if is_sound else f"{kind} {int(index) + 1}"
+
+
+def shown(path: Path) -> str:
+    """Return how a file is named to people."""
+    return config_fields.escaped(str(path), NAME_CHARACTERS)

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import termios
 import threading
 import time
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway import cli
 from gateway import save as save_module
 from gateway.edits import Refused, ask_gateway, ask_reload, history, rollback, set_password
 from gateway.errors import ConfigError, FileChanged, GatewayError, HistoryError, SaveError
@@ -30,6 +32,7 @@ from tests.test_files import as_a_user
 NOBODY_RUNS = "no gateway runs here: the change counts from its next start"
 PASSWORD = "open sesame"  # noqa: S105 - opens nothing but these tests
 HERE = Path(__file__).parent.parent
+SOMEBODY = 4_000_000  # a user that no machine has
 
 
 @pytest.fixture
@@ -425,3 +428,79 @@ def test_a_history_that_cannot_take_the_old_version_does_not_stop_a_rollback(
     told = rollback(place.path, place.state, control, 1)
     assert place.text == text_counting(4)
     assert any("not kept in the history" in line for line in told)
+
+
+# ------------------------------------------------------------------------------------------------ root, elsewhere
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root works in another user's folder")
+@pytest.mark.parametrize("command", [["rollback", "1"], ["init", "--force"], ["passwd"]])
+def test_root_follows_no_link_that_the_folders_owner_has_laid(command: list[str]) -> None:
+    with tempfile.TemporaryDirectory(prefix="rtugate-") as scratch:  # pytest's own folders let nobody else pass
+        top = Path(scratch)
+        top.chmod(0o755)
+        secret = top / "secret.toml"
+        secret.write_text("[log]\n")
+        secret.chmod(0o600)
+        for folder in ("etc", "state/history"):
+            (top / folder).mkdir(parents=True)
+        (top / "state/history/0001.toml").write_text(GOOD)
+        (top / "etc/rtugate.toml").symlink_to(secret)
+        for path in (top / "etc", top / "state", top / "state/history"):
+            os.chown(path, SOMEBODY, SOMEBODY)
+        told = _as_root(top, command)
+        assert (told.returncode, told.stdout) == (1, "")
+        assert "permission denied" in told.stderr.lower()
+        assert secret.read_text() == "[log]\n"
+        assert [path.name for path in (top / "etc").iterdir()] == ["rtugate.toml"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root works in another user's folder")
+def test_what_root_does_in_anothers_folder_belongs_to_that_user() -> None:
+    with tempfile.TemporaryDirectory(prefix="rtugate-") as scratch:
+        top = Path(scratch)
+        top.chmod(0o755)
+        (top / "etc").mkdir()
+        os.chown(top / "etc", SOMEBODY, SOMEBODY)
+        assert _as_root(top, ["init"]).returncode == 0
+        assert _as_root(top, ["passwd"]).returncode == 0
+        assert {path.stat().st_uid for path in (top / "etc").iterdir()} == {SOMEBODY}
+
+
+def _as_root(top: Path, command: list[str]) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, "-m", "gateway", "-c", str(top / "etc/rtugate.toml"), "--state", str(top / "state")]
+    environment = os.environ | {"PYTHONPATH": str(HERE), "RUNTIME_DIRECTORY": ""}
+    return subprocess.run(
+        [*words, *command],
+        input=f"{PASSWORD}\n",
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+def test_what_the_gateway_says_moves_no_cursor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with answering(tmp_path / "control", "hello\x1b]0;evil\x07\nworld\n"):
+        assert cli.main(["--state", str(tmp_path), "status"]) == 0
+    assert capsys.readouterr().out == "hello\\x1b]0;evil\\x07\nworld\n"
+
+
+@contextmanager
+def answering(path: Path, answer: str) -> Iterator[None]:
+    """Something that is in the gateway's place, and says *answer* to whoever asks."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                connection.recv(4096)
+                connection.sendall(answer.encode())
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield
+        thread.join()
