@@ -15,9 +15,11 @@ done
 
 build=$(mktemp -d)
 trap 'rm -rf "$build"' EXIT
+trap 'exit 1' HUP INT TERM # the shell forgets about EXIT otherwise
 mkdir "$build/rtugate"
-tar --create --exclude='./.*' --exclude=./build --exclude=./dist --exclude='*.egg-info' --exclude=__pycache__ . |
-    tar --extract --no-same-owner --directory "$build/rtugate"
+tar --create --file "$build/tree.tar" --warning=no-file-changed --exclude='.[!/]*' --exclude=./build --exclude=./dist \
+    --exclude='*.egg-info' --exclude=__pycache__ . || [ $? = 1 ] # 1: somebody works here meanwhile; 2: it is not whole
+tar --extract --file "$build/tree.tar" --no-same-owner --directory "$build/rtugate"
 # The unit and the udev rule are links there, to where everything of etc/ is.
 cp -RL "$build/rtugate/packaging/debian" "$build/rtugate/debian"
 (cd "$build/rtugate" && dpkg-buildpackage --unsigned-source --unsigned-changes --build=binary)

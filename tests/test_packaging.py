@@ -151,7 +151,7 @@ def test_systemd_gives_the_unit_one_and_a_half_or_less() -> None:
 LAUNCHER: Final = PACKAGING / "rtugate"
 
 
-def launched(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def launched(folder: Path, *words: str, state: str | None = None) -> subprocess.CompletedProcess[str]:
     """Run the command with this tree's modules, in an environment that has nothing of ours."""
     script = folder / "rtugate"
     text = LAUNCHER.read_text()
@@ -159,12 +159,13 @@ def launched(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     script.write_text(text.replace(f'"{MODULES}"', repr(str(ROOT))))
     command = [sys.executable, "-I", str(script), *words]
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(folder / "elsewhere")}
+    environment |= {} if state is None else {"STATE_DIRECTORY": state}
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=CALL_LIMIT_S, check=False)
 
 
 def test_the_command_says_its_version(tmp_path: Path) -> None:
     assert launched(tmp_path, "--version").stdout == f"rtugate {__version__}\n"
-    assert LAUNCHER.read_text().startswith("#!/usr/bin/python3 -I\n")
+    assert LAUNCHER.read_text().startswith("#!/usr/bin/python3 -IS\n")
     assert f"gateway {MODULES.lstrip('/')}" in listed("install")
 
 
@@ -173,9 +174,14 @@ def test_the_command_asks_the_service(tmp_path: Path) -> None:
     assert told.stderr == "rtugate: no gateway runs here (no socket at /run/rtugate/control)\n"
 
 
-@pytest.mark.parametrize("spelling", [["--state", "{}"], ["--state={}"]])
+@pytest.mark.parametrize("spelling", [["--state", "{}"], ["--state={}"], ["--st", "{}"]])
 def test_with_another_state_directory_the_command_asks_the_gateway_there(tmp_path: Path, spelling: list[str]) -> None:
     told = launched(tmp_path, *(word.format(tmp_path) for word in spelling), "status")
+    assert told.stderr == f"rtugate: no gateway runs here (no socket at {tmp_path}/control)\n"
+
+
+def test_with_another_state_directory_in_the_environment_too(tmp_path: Path) -> None:
+    told = launched(tmp_path, "status", state=str(tmp_path))
     assert told.stderr == f"rtugate: no gateway runs here (no socket at {tmp_path}/control)\n"
 
 
@@ -209,8 +215,10 @@ def test_what_the_message_advises_is_valid_once_there_is_a_password() -> None:
     told = MOTD.read_text()
     (found,) = re.finditer(r"(listen = \S+) below (\[\S+\])", told)
     advice, table = found.groups()
-    password = f'[hmi]\npassword = "{hash_password("12345678")}"\n'
-    assert load_text(f"{password}{table}\n{advice}\n", "rtugate.toml").config.hmi.telnet.listen == "0.0.0.0:23"
+    password = f'password = "{hash_password("12345678")}"'
+    text = documents.starting_file().replace("\n[hmi]\n", f"\n[hmi]\n{password}\n")
+    advised = text.replace(f"\n{table}\n", f"\n{table}\n{advice}\n")
+    assert load_text(advised, "rtugate.toml").config.hmi.telnet.listen == "0.0.0.0:23"
 
 
 @pytest.mark.parametrize(
@@ -251,6 +259,8 @@ def test_purge_knows_every_file_that_the_gateway_makes_beside_its_own(tmp_path: 
     save.keep_beside(path, "replaced", 0.0)
     for name in (path.name, documents.SCHEMA_NAME):
         (folder / f".{name}.0123456789ab").touch()  # what a power cut leaves of a save
+    for ending in ("~", ".bak"):  # editors'; dpkg does the same with conffiles
+        path.with_name(path.name + ending).touch()
     purge(tmp_path)
     assert not folder.exists()
     assert not state.exists()
@@ -264,6 +274,38 @@ def test_purge_leaves_what_is_not_ours(tmp_path: Path) -> None:
     purge(tmp_path)
     purge(tmp_path)
     assert sorted(path.name for path in folder.iterdir()) == ["notes.txt", "rtugate.toml.of-2025"]
+
+
+def test_purge_empties_folders_that_are_links_and_leaves_these(tmp_path: Path) -> None:
+    for place, name in (("etc/rtugate", "rtugate.toml"), ("var/lib/rtugate", "last-good.toml")):
+        elsewhere = tmp_path / "data" / place
+        elsewhere.mkdir(parents=True)
+        (elsewhere / name).touch()
+        (tmp_path / place).parent.mkdir(parents=True)
+        (tmp_path / place).symlink_to(elsewhere)
+    purge(tmp_path)
+    assert [path for path in (tmp_path / "data").rglob("*") if path.is_file()] == []
+    assert (tmp_path / "etc/rtugate").is_symlink()
+    assert (tmp_path / "var/lib/rtugate").is_symlink()
+
+
+def test_purge_follows_no_link_that_lies_in_the_folders(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    (victim / "inner").mkdir(parents=True)
+    for place in ("etc/rtugate", "var/lib/rtugate"):
+        (tmp_path / place).mkdir(parents=True)
+    for link in ("etc/rtugate/rtugate.toml", "etc/rtugate/.rtugate.toml.0123456789ab", "var/lib/rtugate/history"):
+        (tmp_path / link).symlink_to(victim)
+    purge(tmp_path)
+    assert (victim / "inner").is_dir()
+    assert not (tmp_path / "etc/rtugate").exists()
+
+
+def test_purge_does_not_fail_for_folders_in_the_folder(tmp_path: Path) -> None:
+    for name in ("mine", "rtugate.toml.rejected-20260101-000000"):
+        (tmp_path / "etc/rtugate" / name).mkdir(parents=True)
+    purge(tmp_path)
+    assert [path.name for path in (tmp_path / "etc/rtugate").iterdir()] == ["mine"]
 
 
 def purge(folder: Path) -> None:
@@ -306,6 +348,47 @@ def test_versions_are_compared_as_numbers() -> None:
 
 def test_a_build_runs_no_tests_without_their_tools_whose_versions_do_not_matter() -> None:
     assert lacks(tools=("pytest>=999", "no-such-tool>=1")) == ["no-such-tool is missing"]
+
+
+PASSES: Final = "def test_one() -> None:\n    assert True\n"
+FAILS: Final = PASSES.replace("True", "False")
+
+
+def needing(dependency: str) -> str:
+    return f'[project]\ndependencies = ["{dependency}"]\noptional-dependencies.test = []\n'
+
+
+def as_built(folder: Path, test: str, project: str) -> subprocess.CompletedProcess[str]:
+    """Run what a build runs of its tests, in *folder*, with one *test* and this pyproject.toml."""
+    (folder / "packaging").mkdir()
+    shutil.copy(PACKAGING / "can_test.py", folder / "packaging")
+    (folder / "pyproject.toml").write_text(project)
+    (folder / "test_one.py").write_text(test)
+    command = ["make", f"--file={DEBIAN / 'rules'}", f"PYTHON={sys.executable}", "override_dh_auto_test"]
+    environment = {"PATH": "/usr/bin:/bin"}  # nothing of a make or a build that these tests may be part of
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=folder, env=environment, timeout=CALL_LIMIT_S, check=False
+    )
+
+
+def test_a_test_that_fails_fails_the_build(tmp_path: Path) -> None:
+    told = as_built(tmp_path, FAILS, needing("pytest>=1"))
+    assert told.returncode != 0
+    assert "1 failed" in told.stdout
+
+
+def test_a_build_tells_of_tests_that_passed(tmp_path: Path) -> None:
+    told = as_built(tmp_path, PASSES, needing("pytest>=1"))
+    assert (told.returncode, "1 passed" in told.stdout) == (0, True)
+
+
+def test_a_build_without_what_the_tests_need_says_so_and_goes_on(tmp_path: Path) -> None:
+    told = as_built(tmp_path, FAILS, needing("no-such-package>=1"))
+    assert (told.returncode, "\nthe tests are not run: no-such-package is missing\n" in told.stdout) == (0, True)
+
+
+def test_a_build_that_cannot_find_out_what_the_tests_need_fails(tmp_path: Path) -> None:
+    assert as_built(tmp_path, PASSES, "[project]\n").returncode != 0
 
 
 # ------------------------------------------------------------------------------------------------ udev

@@ -7,6 +7,7 @@ What needs systemd is tried on a virtual board.
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -16,10 +17,9 @@ from typing import Any, Final
 
 import pytest
 
+from tests.system.package.deb import BUILD_LIMIT_S, ROOT, another_version, built, field
 from tests.system.package.debian13 import HERE, Debian, Entry, bare, demand_programs
 
-ROOT: Final = HERE.parents[2]
-BUILD_LIMIT_S: Final = 600.0
 TESTS_LIMIT_S: Final = 3600.0
 FILE: Final = "/etc/rtugate/rtugate.toml"
 SCHEMA: Final = "/etc/rtugate/rtugate.schema.json"
@@ -31,8 +31,30 @@ ENABLED: Final = (  # deb-systemd-helper's, which go with the purge
     f"{STATES}/rtugate.service.dsh-also",
 )
 TEST_TOOLS: Final = ("python3-pytest", "python3-hypothesis", "python3-babel", "python3-jsonschema")
-TEST_PROGRAMS: Final = ("mbpoll", "telnet", "picocom", "tmux", "strace", "bash-completion", "man-db", "mandoc")
+TEST_PROGRAMS: Final = ("make", "mbpoll", "telnet", "picocom", "tmux", "strace", "bash-completion", "man-db", "mandoc")
 SCRYPT: Final = f"scrypt$16384$8$5${'ab' * 16}${'cd' * 32}"
+
+EXECUTABLE: Final = (
+    "/usr/bin/rtugate",
+    "/etc/update-motd.d/60-rtugate",
+    "/usr/share/python3/runtime.d/rtugate.rtupdate",
+)
+BESIDE_THE_MODULES: Final = (
+    "/usr/lib/systemd/system/rtugate.service",
+    "/usr/lib/sysusers.d/rtugate.conf",
+    "/usr/lib/udev/rules.d/60-rtugate.rules",
+    "/usr/share/bash-completion/completions/rtugate",
+    "/usr/share/doc/rtugate/README.Debian.gz",
+    "/usr/share/doc/rtugate/README.md.gz",
+    "/usr/share/doc/rtugate/changelog.gz",
+    "/usr/share/doc/rtugate/copyright",
+    "/usr/share/doc/rtugate/examples/70-rs485.rules",
+    "/usr/share/doc/rtugate/examples/rtugate.toml",
+    "/usr/share/man/man1/rtugate.1.gz",
+    "/usr/share/man/man5/rtugate.toml.5.gz",
+)
+NOT_OURS: Final = shutil.ignore_patterns(".*", "dist", "build", "__pycache__", "*.egg-info")
+POSTINST: Final = "/var/lib/dpkg/info/rtugate.postinst"
 
 WHAT_USERS_LEAVE: Final = r"/etc/(passwd|group|g?shadow|subuid|subgid)-?|/etc/\.pwd\.lock"  # a user is never removed
 WHAT_APT_KEEPS: Final = r"/var/lib/(dpkg|apt)/.*|/var/log/.*|/var/cache/.*"
@@ -46,21 +68,15 @@ Figure = Callable[[str, object], None]
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The .deb, built here."""
     demand_programs()
-    folder = tmp_path_factory.mktemp("built")
-    subprocess.run(["sh", "packaging/build.sh", str(folder)], cwd=ROOT, check=True, timeout=BUILD_LIMIT_S)
-    (made,) = folder.glob("*.deb")
-    return made
+    return built(tmp_path_factory.mktemp("built"))
 
 
 @pytest.fixture(scope="module")
 def ready(tmp_path_factory: pytest.TempPathFactory, package: Path) -> Debian:
     """Debian 13 with all that the package depends on; it is to be copied."""
     system = bare().copy(tmp_path_factory.mktemp("ready") / "root")
-    depends = subprocess.run(
-        ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True
-    )
     system.apt("update")
-    system.apt("satisfy", depends.stdout.strip())
+    system.apt("satisfy", field(package, "Depends"))
     return system
 
 
@@ -83,17 +99,6 @@ def differences(before: dict[str, Entry], after: dict[str, Entry]) -> list[str]:
     return [path for path in paths if not UNINTERESTING.fullmatch(path)]
 
 
-def another_version(package: Path, folder: Path) -> Path:
-    """Return the same package with a later version."""
-    content, made = folder / "content", folder / "rtugate_later_all.deb"
-    subprocess.run(["dpkg-deb", "--raw-extract", str(package), str(content)], check=True)
-    control = content / "DEBIAN" / "control"
-    control.write_text(re.sub(r"(?m)^(Version: .*)$", r"\1+later", control.read_text()))
-    subprocess.run(["dpkg-deb", "--root-owner-group", "--build", str(content), str(made)], check=True)
-    shutil.rmtree(content)
-    return made
-
-
 # ------------------------------------------------------------------------------------------------ building
 
 
@@ -101,6 +106,52 @@ def test_lintian_has_nothing_to_say(package: Path) -> None:
     command = ["lintian", "--allow-root", "--pedantic", "--no-cfg", str(package.with_name(changes_of(package)))]
     told = subprocess.run(command, capture_output=True, text=True, timeout=BUILD_LIMIT_S, check=False)
     assert (told.returncode, told.stdout) == (0, ""), told.stdout + told.stderr
+
+
+def test_what_is_installed_is_what_belongs_there(package: Path) -> None:
+    rows = [row.split() for row in contents(package)]
+    files = {row[-1].removeprefix("."): row[0] for row in rows if row[0].startswith("-")}
+    assert {row[1] for row in rows} == {"root/root"}
+    assert {row[0] for row in rows if row[0].startswith("d")} == {"drwxr-xr-x"}
+    assert {mode for name, mode in files.items() if name not in EXECUTABLE} == {"-rw-r--r--"}
+    assert {mode for name, mode in files.items() if name in EXECUTABLE} == {"-rwxr-xr-x"}
+    modules = sorted(
+        name.removeprefix("/usr/share/rtugate/") for name in files if name.startswith("/usr/share/rtugate/")
+    )
+    ours = [path for kind in ("*.py", "*.mo") for path in (ROOT / "gateway").rglob(kind)]
+    assert modules == sorted(str(path.relative_to(ROOT)) for path in ours)
+    assert {name for name in files if not name.startswith("/usr/share/rtugate/")} == {*BESIDE_THE_MODULES, *EXECUTABLE}
+
+
+def test_two_builds_make_the_same_bytes_whatever_lies_about(package: Path, tmp_path: Path) -> None:
+    tree = tmp_path / "an other tree"
+    shutil.copytree(ROOT, tree, symlinks=True, ignore=NOT_OURS)
+    for junk in ("gateway/.hidden", "gateway/notes.txt", "gateway/hmi/menu.py~", ".venv/x", "dist/y", "gateway/z/.a"):
+        (tree / junk).parent.mkdir(exist_ok=True)
+        (tree / junk).touch()
+    (tree / "gone").symlink_to("/nowhere")
+    subprocess.run(["find", str(tree), "-exec", "touch", "-hd", "2020-01-01", "{}", "+"], check=True)
+    command = ["sh", "-c", 'umask 077; cd "$1" && make deb', "sh", str(tree)]
+    environment = os.environ | {"TZ": "Asia/Kolkata", "LC_ALL": "de_DE.UTF-8", "DEB_BUILD_OPTIONS": "nocheck"}
+    subprocess.run(command, env=environment, check=True, timeout=BUILD_LIMIT_S)
+    assert (tree / "dist" / package.name).read_bytes() == package.read_bytes()
+
+
+def test_a_tree_that_cannot_be_read_whole_makes_no_package(tmp_path: Path) -> None:
+    tree = tmp_path / "tree"
+    shutil.copytree(ROOT, tree, symlinks=True, ignore=NOT_OURS)
+    for folder in (tmp_path, *tmp_path.parents):  # the way there is not to be what stops it
+        if folder.stat().st_uid == os.geteuid() and folder != Path("/"):
+            folder.chmod(folder.stat().st_mode | 0o011)
+    (tree / "gateway" / "clock.py").chmod(0o600)
+    made = tmp_path / "made"
+    made.mkdir(mode=0o777)
+    made.chmod(0o777)
+    command = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "sh", "packaging/build.sh", str(made)]
+    told = subprocess.run(command, cwd=tree, capture_output=True, text=True, timeout=BUILD_LIMIT_S, check=False)
+    assert told.returncode != 0
+    assert "clock.py: Cannot open: Permission denied" in told.stderr
+    assert list(made.iterdir()) == []
 
 
 def changes_of(package: Path) -> str:
@@ -131,8 +182,23 @@ def contents(package: Path) -> list[str]:
 
 def copy_tree(system: Debian, folder: str) -> None:
     """Put what belongs to this tree into *folder* there, without what git ignores."""
-    left_out = shutil.ignore_patterns(".*", "dist", "build", "__pycache__", "*.egg-info")
-    shutil.copytree(ROOT, system.root / folder.lstrip("/"), symlinks=True, ignore=left_out, dirs_exist_ok=True)
+    shutil.copytree(ROOT, system.root / folder.lstrip("/"), symlinks=True, ignore=NOT_OURS, dirs_exist_ok=True)
+
+
+def test_on_debian_13_the_build_runs_the_tests_and_fails_with_them(system: Debian) -> None:
+    tools = ("build-essential", "debhelper", "dh-python", *TEST_TOOLS)
+    system.apt("install", "--no-install-recommends", *tools)
+    copy_tree(system, "/root/rtugate")
+    tests = system.root / "root/rtugate/tests"
+    shutil.rmtree(tests)
+    tests.mkdir()
+    (tests / "test_one.py").write_text("def test_one() -> None:\n    assert True\n")
+    assert "1 passed" in system.shell("sh /root/rtugate/packaging/build.sh /root/built")
+    (tests / "test_one.py").write_text("def test_one() -> None:\n    assert False\n")
+    told = system.shell("! sh /root/rtugate/packaging/build.sh /root/not-built; ls /root/not-built | wc --lines")
+    assert "1 failed" in told
+    assert told.endswith("\n0\n")
+    system.shell("DEB_BUILD_OPTIONS=nocheck sh /root/rtugate/packaging/build.sh /root/built-unchecked")
 
 
 # ------------------------------------------------------------------------------------------------ installing
@@ -195,6 +261,77 @@ def test_the_login_message_has_three_lines_until_a_password_is_set(installed: De
     path.write_text(path.read_text().replace('#password = ""', f'password = "{SCRYPT}"'))
     assert installed.run("rtugate", "check").startswith(f"{FILE}: valid\n")
     assert message() == []
+
+
+def test_a_file_that_was_brought_before_is_used_and_can_be_saved(system: Debian, package: Path) -> None:
+    system.shell(f"mkdir /etc/rtugate; printf '[log]\\n' >{FILE}; chmod 0600 {FILE}")
+    system.apt("install", system.bring(package))
+    after = system.tree()
+    assert after["/etc/rtugate"] == Entry(0o42770, "rtugate:rtugate", "")
+    assert (after[FILE].mode, after[FILE].owner) == (0o100640, "rtugate:rtugate")
+    assert (system.root / FILE.lstrip("/")).read_text() == "[log]\n"
+    assert after[SCHEMA].owner == "rtugate:rtugate"
+
+
+@pytest.mark.parametrize(
+    "beforehand",
+    [
+        f"mkdir /etc/rtugate; printf '[broken' >{FILE}",
+        f"mkdir /etc/rtugate; ln -s /data/not-there-yet {FILE}",
+        "mkdir -p /data/rtugate; ln -s /data/rtugate /etc/rtugate",
+        "useradd --create-home --home-dir /home/plant --uid 4711 --user-group rtugate",
+        "groupadd --gid 4711 rtugate",
+        "umask 077; export LANG=de_DE.UTF-8 STATE_DIRECTORY=/x RUNTIME_DIRECTORY=/y",
+    ],
+)
+def test_whatever_was_there_it_can_be_installed_and_purged(system: Debian, package: Path, beforehand: str) -> None:
+    told = system.shell(f"{beforehand}; dpkg --install {system.bring(package)}")
+    assert "not saved" not in told
+    is_link = (system.root / "etc/rtugate").is_symlink()
+    folder = system.root / ("data/rtugate" if is_link else "etc/rtugate")
+    assert (folder.stat().st_mode & 0o7777, folder.stat().st_gid) == (0o2770, group_id(system))
+    system.apt("purge", "rtugate")
+
+
+def group_id(system: Debian) -> int:
+    return int(system.run("getent", "group", "rtugate").split(":")[2])
+
+
+def test_an_override_of_the_folders_rights_counts(system: Debian, package: Path) -> None:
+    system.shell("dpkg-statoverride --add '#4711' root 2750 /etc/rtugate")
+    system.shell(f"mkdir /etc/rtugate; printf '[log]\\n' >{FILE}; dpkg --install {system.bring(package)}")
+    status = (system.root / "etc/rtugate").stat()
+    assert (status.st_uid, status.st_gid, status.st_mode & 0o7777) == (4711, 0, 0o2750)
+
+
+def test_where_the_file_cannot_be_made_it_says_why_and_a_second_try_succeeds(system: Debian, package: Path) -> None:
+    told = system.shell(
+        f"""
+        mkdir /etc/rtugate
+        mount -t tmpfs -o size=8k,mode=0755 none /etc/rtugate
+        ! dpkg --install {system.bring(package)}
+        umount /etc/rtugate
+        dpkg --configure --pending
+        """
+    )
+    assert "is not saved: no space left on the device" in told
+    assert system.run("rtugate", "check").startswith(f"{FILE}: valid\n")
+
+
+def test_what_pip_has_brought_is_not_used(installed: Debian) -> None:
+    (python,) = (installed.root / "usr/local/lib").glob("python3*")
+    modules = python / "dist-packages"
+    modules.mkdir(exist_ok=True)
+    for name in ("pydantic", "serial", "sitecustomize"):
+        (modules / f"{name}.py").write_text("raise SystemExit('pip was here')\n")
+    command = installed.root / "usr/local/bin/rtugate"
+    command.write_text("#!/bin/sh\nexit 9\n")
+    command.chmod(0o755)
+    told = installed.shell(
+        f"/usr/bin/rtugate check; rm {FILE}; mv /usr/local/lib/python3*/dist-packages /root; {POSTINST} configure ''"
+    )
+    assert told.startswith(f"{FILE}: valid\n")
+    assert (installed.root / FILE.lstrip("/")).exists()
 
 
 # ------------------------------------------------------------------------------------------------ upgrading, going away
@@ -262,10 +399,35 @@ def test_purge_leaves_what_somebody_else_put_beside_the_file(installed: Debian) 
     ]
 
 
+@pytest.mark.parametrize("owner", ["root", "4711"])
+def test_an_upgrade_does_not_fail_for_what_only_editors_need(installed: Debian, package: Path, owner: str) -> None:
+    told = installed.shell(f"chown {owner}:{owner} /etc/rtugate {SCHEMA}; dpkg --install {installed.bring(package)}")
+    assert f"{SCHEMA} is not renewed" in told
+    assert sorted(path.name for path in (installed.root / "etc/rtugate").iterdir()) == [
+        "rtugate.schema.json",
+        "rtugate.toml",
+    ]
+
+
+def test_purge_copes_with_mounts_links_and_folders(installed: Debian) -> None:
+    told = installed.shell(
+        """
+        mkdir /data /data/rtugate /var/lib/rtugate /etc/rtugate/mine
+        touch /data/rtugate/last-good.toml
+        mount --bind /etc/rtugate /etc/rtugate
+        mount --bind /data/rtugate /var/lib/rtugate
+        dpkg --purge rtugate
+        """
+    )
+    assert "error" not in told
+    assert [path.name for path in (installed.root / "etc/rtugate").iterdir()] == ["mine"]
+    assert list((installed.root / "data/rtugate").iterdir()) == []
+
+
 def test_every_script_may_be_run_again(installed: Debian) -> None:
     before = installed.tree()
     for _ in range(2):
-        installed.run("/var/lib/dpkg/info/rtugate.postinst", "configure", "")
+        installed.run(POSTINST, "configure", "")
     assert differences(before, installed.tree()) == []
     postrm = installed.bring(installed.root / "var/lib/dpkg/info/rtugate.postrm")
     installed.apt("purge", "rtugate")
@@ -279,7 +441,7 @@ def test_a_link_laid_by_the_group_is_not_followed_by_root(installed: Debian) -> 
         rm {FILE} {SCHEMA}
         ln -s /root/victim {SCHEMA}
         ln -s /root/victim {SCHEMA}.new
-        /var/lib/dpkg/info/rtugate.postinst configure '' || true
+        {POSTINST} configure '' || true
         rm -f {FILE}
         """
     )
