@@ -289,10 +289,10 @@ class Console:
 
 
 @contextmanager
-def console(device: str, **hmi: Any) -> Iterator[Console]:
+def console(device: str, baudrate: int = 38400, **hmi: Any) -> Iterator[Console]:
     """Give a console that runs on *device*."""
     house = House(CLOCK, serial={"line": device}, **hmi)
-    settings = SerialSettings(device, baudrate=38400, parity="none", mark_errors=True)
+    settings = SerialSettings(device, baudrate=baudrate, parity="none", mark_errors=True)
     with contextlib.closing(Waker()) as waker:
         task = SerialConsole(house.shared, CLOCK, waker, lambda: open_serial(settings, waker, CLOCK), 0.05)
         with running(task) as run:
@@ -341,7 +341,7 @@ def test_a_real_ff_and_a_nul_through_a_port_that_marks_errors(pty: Pty) -> None:
 def test_a_storm_of_bytes_ends_and_the_console_still_answers(pty: Pty) -> None:
     long_screen = b"B"  # takes a second; what comes meanwhile waits
     storm = long_screen + random.Random(5).randbytes(100_000).translate(None, b"qQXB")
-    with console(pty.device) as desk:
+    with console(pty.device, baudrate=115200) as desk:
         got = bytearray()
         rest = memoryview(storm)
         while rest:
