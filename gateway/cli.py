@@ -230,10 +230,12 @@ def _rollback(parsed: argparse.Namespace) -> int:
 
 
 def _init(parsed: argparse.Namespace) -> int:
+    from gateway import documents
     from gateway.edits import start_file
 
     path = _file_of(parsed)
-    return _tell(lambda: start_file(path, parsed.force), path.parent)
+    text, schema_text = documents.starting_file().encode(), documents.schema_text().encode()  # imports, as who we are
+    return _tell(lambda: start_file(path, text, schema_text, parsed.force), path.parent)
 
 
 def _tell(work: Callable[[], list[str]], folder: Path | None = None) -> int:

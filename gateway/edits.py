@@ -106,10 +106,9 @@ def _keep_present(path: Path, content: bytes, history: History) -> tuple[str | N
     return text, history.keep(text)
 
 
-def start_file(path: Path, is_forced: bool) -> list[str]:
+def start_file(path: Path, text: bytes, schema_text: bytes, is_forced: bool) -> list[str]:
     """Write a file to start from, and its schema beside it; return what to tell. Raises GatewayError."""
     before, schema = _content_if_any(path), path.with_name(documents.SCHEMA_NAME)
-    text = documents.starting_file().encode()
     if path == schema:
         raise SaveError(f"rtugate: {shown(path)}: the schema is called so: take another name")
     if before is not None and not is_forced:
@@ -117,7 +116,7 @@ def start_file(path: Path, is_forced: bool) -> list[str]:
             f"rtugate: {shown(path)}: this file exists: --force keeps it under another name and writes a new one"
         )
     kept = None if before in (None, text) else keep_beside(path, "replaced", SystemClock().wall())
-    write_atomically(schema, documents.schema_text().encode(), READABLE)
+    write_atomically(schema, schema_text, READABLE)
     write_atomically(path, text)
     return [
         f"{shown(path)}: written" + (f"; what was there is now {shown(Path(kept.name))}" if kept else ""),

@@ -63,10 +63,8 @@ GET_TIMEOUT: Final = reading(7, NUMBER.size, _MACHINE)
 _OPENING: Final = {
     **dict.fromkeys((errno.ENOENT, errno.ENOTDIR), "is not there (is its driver loaded?)"),
     **dict.fromkeys((errno.ENXIO, errno.ENODEV), "nobody is behind it (no driver, no reader)"),
-    **dict.fromkeys(
-        (errno.EACCES, errno.EPERM),
-        "permission denied; it is root's until a udev rule gives it to a group that this program's user is in",
-    ),
+    errno.EACCES: "permission denied; it is root's until a udev rule gives it to a group that this program's user has",
+    errno.EPERM: "not permitted: the service's unit has no DeviceAllow= for it",
     errno.EBUSY: "another program has it (systemd, if its RuntimeWatchdogSec is set)",
     errno.EISDIR: "is a folder and no watchdog",
 }

@@ -305,6 +305,7 @@ def test_what_a_driver_calls_itself_moves_no_cursor(kernel: KernelWatchdog, said
             errno.EACCES,
             "permission denied; it is root's until a udev rule gives it to a group that this program's user",
         ),
+        (errno.EPERM, "not permitted: the service's unit has no DeviceAllow= for it"),
         (errno.EMFILE, "too many open files"),
     ],
 )

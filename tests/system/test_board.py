@@ -117,7 +117,9 @@ def test_a_hang_restarts_only_the_process_where_systemd_does(
     wait_new_process(board, pid)
     record_property(f"{kind}: from the hang to polling", f"{time.monotonic() - begun_s:.0f} s")
     assert board.show("NRestarts")["NRestarts"] == "1"
-    assert board.status()["last_restart"] == "hang of field"
+    told, _, names = board.status()["last_restart"].partition("hang of ")
+    assert told == ""
+    assert "field" in names.split(", ")  # who holds the interpreter may have bystanders beside it
     assert machine.do("cat /proc/sys/kernel/random/boot_id") == boot_id
     is_not_reset(board, boot_id)
 

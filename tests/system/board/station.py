@@ -40,20 +40,47 @@ ANSWER_S: Final = 5.0  # that mbpoll waits: the board is slow
 START_LIMIT_S: Final = 180.0  # the gateway takes 3 s on an idle machine, 20 s right after a boot on a busy one
 SEVERAL: Final = 5  # polls: no left-over
 ORDER: Final = "/run/faults/order"  # who is to commit which fault: tests.hanging
+INSTALL_LIMIT_S: Final = 300.0
+NO_TELNET: Final = section("[hmi.telnet]", listen="")
+
+
+def configuration(unit: int = OUR_UNIT, timeout_s: float = TIMEOUT_S, beside: str = NO_TELNET) -> str:
+    """Return the board's file. *unit*: what its slave answers to; *beside*: what it has beside the serial ports."""
+
+    def request(name: str, device: int, table: int, address: int, count: int, point: int) -> str:
+        keys = {"name": name, "unit": device, "function": table, "address": address, "count": count, "point": point}
+        return section("[[master.request]]", **keys, every=EVERY_S)
+
+    return "\n".join(
+        (
+            "# The virtual board: what stands in comments is kept.",
+            section("[watchdog]", timeout=timeout_s, device="/dev/watchdog", device_timeout=DEVICE_TIMEOUT_S),
+            section("[hmi.serial]", line="/dev/ttyS2"),
+            section("[[master]]", name="field", line="/dev/ttyS0", baudrate=BAUD, parity="none"),
+            request("meter", METER_UNIT, 3, 0, 4, 0),
+            section("[[master]]", name="plant", line="/dev/ttyS3", baudrate=BAUD, parity="none"),
+            request("boiler", BOILER_UNIT, 3, 107, 2, 100),
+            section("[[slave]]", name="plc", line="/dev/ttyS1", unit=unit, baudrate=BAUD, parity="none"),
+            beside,
+        )
+    )
 
 
 @dataclass(frozen=True)
 class Delivery:
     """How rtugate gets onto a board.
 
-    packages: of Debian, in what the board boots from.
-    fill:     puts what is to be installed into a folder, which the board finds at /mnt.
-    script:   installs it from there, by the board's shell, as root; the service is enabled afterwards, and not started.
+    packages:      of Debian, in what the board boots from.
+    fill:          puts what is to be installed into a folder, which the board finds at /mnt.
+    script:        installs it from there, by the board's shell, as root; the service is enabled afterwards, and not
+                   started.
+    configuration: the board's file, for the unit that its slave answers to.
     """
 
     packages: Sequence[str]
     fill: Callable[[Path], None]
     script: str
+    configuration: Callable[[int], str] = configuration
 
 
 def _bring_sources(folder: Path) -> None:
@@ -75,28 +102,6 @@ def _bring_faults(folder: Path) -> None:
     (folder / "faults" / "tests" / "__init__.py").touch()
     target = folder / "faults" / "tests" / "hanging"
     shutil.copytree(ROOT / "tests" / "hanging", target, ignore=shutil.ignore_patterns("__pycache__"))
-
-
-def configuration(unit: int = OUR_UNIT) -> str:
-    """Return the board's file; *unit*: what its slave answers to."""
-
-    def request(name: str, device: int, table: int, address: int, count: int, point: int) -> str:
-        keys = {"name": name, "unit": device, "function": table, "address": address, "count": count, "point": point}
-        return section("[[master.request]]", **keys, every=EVERY_S)
-
-    return "\n".join(
-        (
-            "# The virtual board: what stands in comments is kept.",
-            section("[watchdog]", timeout=TIMEOUT_S, device="/dev/watchdog", device_timeout=DEVICE_TIMEOUT_S),
-            section("[hmi.serial]", line="/dev/ttyS2"),
-            section("[hmi.telnet]", listen=""),
-            section("[[master]]", name="field", line="/dev/ttyS0", baudrate=BAUD, parity="none"),
-            request("meter", METER_UNIT, 3, 0, 4, 0),
-            section("[[master]]", name="plant", line="/dev/ttyS3", baudrate=BAUD, parity="none"),
-            request("boiler", BOILER_UNIT, 3, 107, 2, 100),
-            section("[[slave]]", name="plc", line="/dev/ttyS1", unit=unit, baudrate=BAUD, parity="none"),
-        )
-    )
 
 
 class TimedDevice(Device):
@@ -123,9 +128,16 @@ class Station:
     meter:  polled on ttyS0, its 4 holding registers become 0 to 3; boiler: on ttyS3, its 2 become 100 and 101.
     """
 
-    def __init__(self, machine: Machine, meter: TimedDevice, boiler: TimedDevice, upper_line: str) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        meter: TimedDevice,
+        boiler: TimedDevice,
+        upper_line: str,
+        file: Callable[[int], str] = configuration,
+    ) -> None:
         self.machine, self.meter, self.boiler = machine, meter, boiler
-        self._upper_line = upper_line
+        self._upper_line, self._file = upper_line, file
         self._numbers = iter(range(1000, 65000))
 
     # -------------------------------------------------------------------------------------------- what is to be seen
@@ -222,7 +234,7 @@ class Station:
 
     def configure(self, unit: int = OUR_UNIT) -> None:
         """Write the board's file."""
-        self.machine.put(CONFIG, configuration(unit))
+        self.machine.put(CONFIG, self._file(unit))
         self.machine.do("chown -R rtugate: /etc/rtugate && sync")
 
     def drop_in(self, text: str) -> None:
@@ -238,7 +250,7 @@ class Station:
         self.machine.do("mkdir -p /run/faults && chown rtugate: /run/faults")
         program = "/usr/bin/python3 -m tests.hanging run"
         paths = "PYTHONPATH=/usr/share/rtugate-faults:/usr/share/rtugate"
-        environment = f"Environment={paths} RTUGATE_FAULT={ORDER}"
+        environment = f"Environment={paths} RTUGATE_FAULT={ORDER}\nReadWritePaths=/run/faults"
         self.drop_in(f"[Service]\nExecStart=\nExecStart={program}\n{environment}\nRestart={restart}\n")
         self.restart()
 
@@ -269,9 +281,9 @@ def station(folder: Path, delivery: Delivery = SOURCES) -> Iterator[Station]:
         near, far = stack.enter_context(cable())
         wires = (ports[0], near, "", ports[1])
         board = stack.enter_context(a_machine(folder / "board", base(delivery.packages), parts, wires))
-        board.do(f"mount -o ro /dev/vdb /mnt\n{delivery.script}")
+        board.do(f"mount -o ro /dev/vdb /mnt\n{delivery.script}", INSTALL_LIMIT_S)
         board.do("cp -r /mnt/faults /usr/share/rtugate-faults")
-        made = Station(board, meter, boiler, far)
+        made = Station(board, meter, boiler, far, delivery.configuration)
         made.configure()
         board.do("systemctl start rtugate.service")
         yield made
