@@ -169,8 +169,11 @@ class ConfigFile:
         self._adopt(loaded, waits)
         return loaded.config
 
-    def refused(self) -> None:
+    def refused(self, error: ConfigError) -> None:
         """The file as it is now cannot be used: an alarm, since the next start will not find what runs in it."""
+        self._trouble = ""
+        if isinstance(error.__cause__, PermissionError):
+            self._complain(f"{self.path.name} cannot be read: {files.in_words(error.__cause__, self.path)}")
         if self._known.loaded is not None:  # else there is such an alarm already
             self._alarm = self._told(N_("{file} was edited and cannot be used (L shows why): what ran before goes on"))
 

@@ -29,6 +29,7 @@ PASSWORD: Final = ("hmi", "password")
 READABLE: Final = 0o644  # mode of a file without secrets
 NO_HASH_YET: Final = "scrypt$"  # what passes for one until there is one
 ANSWER_LIMIT_S: Final = 65.0
+ANSWER_MOST: Final = 64 * 1024 * 1024  # characters: whoever is in the gateway's place does not get all memory
 ABSENT: Final = (FileNotFoundError, NotADirectoryError, ConnectionRefusedError)
 
 
@@ -188,7 +189,7 @@ def ask_gateway(control_path: Path, line: str) -> str | None:
             connection.connect(str(control_path))
             connection.sendall(f"{line}\n".encode())
             with connection.makefile("r", encoding="utf-8", errors="replace") as answer:
-                return answer.read().strip()
+                return answer.read(ANSWER_MOST).strip()
         except ABSENT:
             return None
         except OSError as error:

@@ -20,6 +20,7 @@ import secrets
 import shlex
 import stat
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -62,16 +63,22 @@ def as_owner_of(folder: Path) -> Iterator[None]:
     if os.geteuid() != 0 or status.st_uid == 0:
         yield
         return
-    groups, group = os.getgroups(), os.getegid()
-    os.setgroups([])
-    os.setegid(status.st_gid)
-    os.seteuid(status.st_uid)
-    try:
+    with contextlib.ExitStack() as back:
+        steps = (
+            (partial(os.setgroups, []), partial(os.setgroups, os.getgroups())),
+            (partial(os.setegid, status.st_gid), partial(os.setegid, os.getegid())),
+            (partial(os.seteuid, status.st_uid), partial(os.seteuid, 0)),
+        )
+        for become, come_back in steps:
+            try:
+                become()
+            except OSError as error:  # a root without its rights, as in some containers
+                name = escaped(str(folder), NAME_CHARACTERS)
+                raise SaveError(
+                    f"{name} is another user's, and cannot be worked in as that one: {error.strerror}"
+                ) from error
+            back.callback(come_back)
         yield
-    finally:
-        os.seteuid(0)
-        os.setegid(group)
-        os.setgroups(groups)
 
 
 def write_atomically(path: Path, content: bytes, mode_for_new: int = MODE_FOR_NEW) -> None:
@@ -113,7 +120,7 @@ def _replace(target: Path, content: bytes, mode_for_new: int) -> None:
         _give_to_owner_of(
             target.parent.stat() if old is None else old, descriptor
         )  # also what root makes for the service
-        os.fchmod(descriptor, mode_for_new if old is None else stat.S_IMODE(old.st_mode))
+        os.fchmod(descriptor, mode_for_new if old is None else old.st_mode & 0o777)  # the unit forbids the other bits
         os.fsync(descriptor)
         temporary.rename(target)
     except BaseException:

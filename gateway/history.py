@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gateway.errors import HistoryError, SaveError
+from gateway.errors import ConfigError, HistoryError, SaveError
 from gateway.files import in_words, write_atomically
+from gateway.store import read
 
 KEPT: Final = 10
 _NAME: Final = re.compile(r"([0-9]{4}|[1-9][0-9]{4,8})\.toml")
@@ -46,14 +47,14 @@ class History:
             self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
             numbers = sorted(self._numbers())
             newest = numbers[-1] if numbers else 0
-            if not newest or self._path(newest).read_bytes() != text.encode():
+            if not newest or read(self._path(newest)) != text.encode():
                 write_atomically(self._path(newest + 1), text.encode())
                 numbers.append(newest + 1)
             for number in numbers[:-KEPT]:
                 self._path(number).unlink(missing_ok=True)
         except OSError as error:
             return f"this version is not kept in the history: {in_words(error, self._path(1))}"
-        except SaveError as error:
+        except (SaveError, ConfigError) as error:
             return f"this version is not kept in the history: {error}"
         return None
 
@@ -74,11 +75,13 @@ class History:
     def text(self, number: int) -> str:
         """Return what version *number* says; raises HistoryError."""
         try:
-            return self._path(number).read_bytes().decode()
+            return read(self._path(number)).decode()
         except FileNotFoundError as error:
             raise HistoryError(f"there is no version {number}: `rtugate history` lists what there is") from error
         except UnicodeDecodeError as error:
             raise HistoryError(f"version {number} is damaged: it is not UTF-8") from error
+        except ConfigError as error:
+            raise HistoryError(f"version {number} is no file") from error
         except OSError as error:
             raise HistoryError(f"version {number} cannot be read: {in_words(error, self._path(number))}") from error
 

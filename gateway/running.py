@@ -366,7 +366,7 @@ class Gateway:
         except ConfigError as error:
             log_findings(error)
             log.error("%s: not reloaded, nothing has changed", self.path.name, extra={"is_unlimited": True})
-            self.file.refused()
+            self.file.refused(error)
             raise ConfigError([f"not reloaded, nothing has changed: {error.findings[0]}"]) from error
 
     def in_background(self, work: Callable[[], None], told: Callable[[], None]) -> Job:

@@ -66,7 +66,9 @@ class Shell:
         )
         os.close(terminal)
         os.close(tells)
-        self._type(f"unset HISTFILE; tell() {{ printf '%s\\n' \"$@\" . >&{tells}; }}; . {SCRIPT}{ENTER}")
+        self._type(
+            f"unset HISTFILE; tell() {{ printf '%s\\n' \"$@\" . >&{tells}; }}; . {shlex.quote(str(SCRIPT))}{ENTER}"
+        )
 
     def close(self) -> None:
         self._process.kill()
@@ -102,7 +104,7 @@ class Shell:
 def shell(tmp_path: Path) -> Iterator[Shell]:
     (tmp_path / "bin").mkdir()
     program = tmp_path / "bin" / "rtugate"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m gateway "$@"\n')
+    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m gateway "$@"\n')
     program.chmod(0o755)
     with contextlib.closing(Shell(tmp_path)) as opened:
         yield opened

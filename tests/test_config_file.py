@@ -132,6 +132,25 @@ def test_a_file_that_the_service_may_not_read_is_an_alarm_that_says_what_to_type
 # ------------------------------------------------------------------------------------------------ reloading
 
 
+def test_a_file_that_a_reload_may_not_read_is_an_alarm_that_says_what_to_type(open_place: Place) -> None:
+    file = open_place.started()
+    open_place.path.chmod(0)
+    with as_a_user():
+        with pytest.raises(ConfigError) as refused:
+            file.reload()
+        file.refused(refused.value)
+    assert "rtugate.toml cannot be read: permission denied; what helps, typed as root: ch" in told(file)[1]
+    open_place.path.chmod(0o640)
+    open_place.path.write_text(BAD)
+    with pytest.raises(ConfigError) as refused:
+        file.reload()
+    file.refused(refused.value)
+    assert len(told(file)) == 1
+    open_place.path.write_text(GOOD)
+    file.reload()
+    assert told(file) == []
+
+
 def test_a_reload_reads_what_somebody_has_edited(place: Place) -> None:
     file = place.started()
     place.path.write_text(EDITED)

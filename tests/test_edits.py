@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import signal
@@ -12,7 +13,7 @@ import tempfile
 import termios
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from gateway import cli
 from gateway import save as save_module
 from gateway.edits import Refused, ask_gateway, ask_reload, history, rollback, set_password
 from gateway.errors import ConfigError, FileChanged, GatewayError, HistoryError, SaveError
+from gateway.files import as_owner_of
 from gateway.history import KEPT, History
 from gateway.hmi.access import check_password
 from tests.config_files import BAD, EDITED, GOOD, Place, config_of, text_counting
@@ -359,6 +361,17 @@ def test_the_oldest_version_can_be_had_although_it_is_forgotten_by_that(place: P
     assert place.history() == [*(text_counting(count) for count in range(13, 11 + KEPT)), GOOD, text_counting(11)]
 
 
+@pytest.mark.parametrize("laid", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_a_version_that_is_no_file_is_not_waited_for(
+    place: Place, control: Path, laid: Callable[[Path], object]
+) -> None:
+    versions(place, 4)
+    (place.state / "history/0001.toml").unlink()
+    laid(place.state / "history/0001.toml")
+    with pytest.raises(HistoryError, match="version 1 is no file"):
+        rollback(place.path, place.state, control, 1)
+
+
 def test_a_version_that_is_not_there_or_damaged_is_refused_and_the_file_stays(place: Place, control: Path) -> None:
     versions(place, 4, 126)
     for number, error in ((3, HistoryError), (2, ConfigError)):
@@ -453,6 +466,22 @@ def test_root_follows_no_link_that_the_folders_owner_has_laid(command: list[str]
         assert "permission denied" in told.stderr.lower()
         assert secret.read_text() == "[log]\n"
         assert [path.name for path in (top / "etc").iterdir()] == ["rtugate.toml"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root works in another user's folder")
+def test_a_root_without_its_rights_is_told_so_and_has_them_as_before() -> None:
+    with tempfile.TemporaryDirectory(prefix="rtugate-") as scratch:
+        os.chown(scratch, 2**32 - 2, SOMEBODY)
+        before = (os.getgroups(), os.getegid(), os.geteuid())
+
+        def refuse(_: int) -> None:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(os, "seteuid", refuse)
+            with pytest.raises(SaveError, match="is another user's"), as_owner_of(Path(scratch)):
+                raise AssertionError
+        assert (os.getgroups(), os.getegid(), os.geteuid()) == before
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root works in another user's folder")

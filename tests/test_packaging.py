@@ -5,6 +5,7 @@ The scripts are run with folders of their own in place of the system's.
 
 from __future__ import annotations
 
+import os
 import re
 import runpy
 import shutil
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,6 +29,7 @@ PACKAGING: Final = ROOT / "packaging"
 DEBIAN: Final = PACKAGING / "debian"
 UNIT: Final = ROOT / "etc" / "rtugate.service"
 MODULES: Final = "/usr/share/rtugate"
+RUNTIME: Final = "/run/rtugate"
 LINE_COLUMNS: Final = 79
 CALL_LIMIT_S: Final = 60.0
 PROJECT: Final[dict[str, Any]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -133,6 +136,7 @@ def test_the_service_has_no_right_but_low_ports() -> None:
     assert "m rtugate dialout" in (DEBIAN / "rtugate.sysusers").read_text()
     assert only("ProtectSystem") == "strict"
     assert only("DevicePolicy") == "closed"
+    assert only("SecureBits").split() == ["noroot", "noroot-locked"]  # the lock alone keeps it from being set
 
 
 def test_the_service_reads_what_it_needs_of_proc() -> None:
@@ -155,8 +159,10 @@ def launched(folder: Path, *words: str, state: str | None = None) -> subprocess.
     """Run the command with this tree's modules, in an environment that has nothing of ours."""
     script = folder / "rtugate"
     text = LAUNCHER.read_text()
-    assert f'"{MODULES}"' in text
-    script.write_text(text.replace(f'"{MODULES}"', repr(str(ROOT))))
+    for place, ours in ((MODULES, ROOT), (RUNTIME, folder / "run")):  # a gateway of this machine is left alone
+        assert f'"{place}"' in text
+        text = text.replace(f'"{place}"', repr(str(ours)))
+    script.write_text(text)
     command = [sys.executable, "-I", str(script), *words]
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(folder / "elsewhere")}
     environment |= {} if state is None else {"STATE_DIRECTORY": state}
@@ -171,7 +177,7 @@ def test_the_command_says_its_version(tmp_path: Path) -> None:
 
 def test_the_command_asks_the_service(tmp_path: Path) -> None:
     told = launched(tmp_path, "status")
-    assert told.stderr == "rtugate: no gateway runs here (no socket at /run/rtugate/control)\n"
+    assert told.stderr == f"rtugate: no gateway runs here (no socket at {tmp_path}/run/control)\n"
 
 
 @pytest.mark.parametrize("spelling", [["--state", "{}"], ["--state={}"], ["--st", "{}"]])
@@ -193,7 +199,7 @@ MOTD: Final = PACKAGING / "motd" / "60-rtugate"
 def message(folder: Path, text: str | None, has_program: bool = True) -> list[str]:
     """Return what somebody who logs in is told; *text*: what the file says, None: there is none."""
     for place in ("usr/bin", "etc/rtugate"):
-        (folder / place).mkdir(parents=True)
+        (folder / place).mkdir(parents=True, exist_ok=True)
     if text is not None:
         (folder / "etc/rtugate/rtugate.toml").write_text(text)
     if has_program:
@@ -243,6 +249,22 @@ def test_a_password_in_a_comment_is_none(tmp_path: Path) -> None:
 def test_without_the_program_or_its_file_there_is_no_message(tmp_path: Path) -> None:
     assert message(tmp_path / "removed", documents.starting_file(), has_program=False) == []
     assert message(tmp_path / "unconfigured", None) == []
+
+
+@pytest.mark.parametrize("laid", [os.mkfifo, lambda path: path.symlink_to("/dev/zero"), Path.mkdir])
+def test_nobody_is_kept_from_logging_in_by_what_lies_in_the_files_place(
+    tmp_path: Path, laid: Callable[[Path], object]
+) -> None:
+    (tmp_path / "etc/rtugate").mkdir(parents=True)
+    laid(tmp_path / "etc/rtugate/rtugate.toml")
+    assert message(tmp_path, None) == []
+
+
+def test_no_more_of_a_file_is_read_at_a_login_than_it_may_have(tmp_path: Path) -> None:
+    (tmp_path / "etc/rtugate").mkdir(parents=True)
+    with (tmp_path / "etc/rtugate/rtugate.toml").open("wb") as file:
+        file.truncate(2**40)
+    assert len(message(tmp_path, None)) == 3
 
 
 # ------------------------------------------------------------------------------------------------ purge
@@ -306,6 +328,15 @@ def test_purge_does_not_fail_for_folders_in_the_folder(tmp_path: Path) -> None:
         (tmp_path / "etc/rtugate" / name).mkdir(parents=True)
     purge(tmp_path)
     assert [path.name for path in (tmp_path / "etc/rtugate").iterdir()] == ["mine"]
+
+
+def test_purge_copes_with_more_files_than_one_command_takes(tmp_path: Path) -> None:
+    folder = tmp_path / "etc/rtugate"
+    folder.mkdir(parents=True)
+    for number in range(20_000):
+        (folder / f".rtugate.toml.{number:0200}").touch()
+    purge(tmp_path)
+    assert not folder.exists()
 
 
 def purge(folder: Path) -> None:

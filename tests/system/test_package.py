@@ -438,6 +438,8 @@ def test_every_script_may_be_run_again(installed: Debian) -> None:
 def test_a_link_laid_by_the_group_is_not_followed_by_root(installed: Debian) -> None:
     installed.shell(
         f"""
+        mkfifo --mode=0666 {SCHEMA}.new
+        timeout 20 {POSTINST} configure 0.1 || exit 1 # it is not waited for
         rm {FILE} {SCHEMA}
         ln -s /root/victim {SCHEMA}
         ln -s /root/victim {SCHEMA}.new
