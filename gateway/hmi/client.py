@@ -2,12 +2,14 @@
 
 What it is: bytes both ways until one side ends; Ctrl-] leaves whatever the menu does. The terminal is what it was
 afterwards, also when the program is told to end (SIGTERM, SIGHUP).
-What it refuses: understanding what goes through.
+What it refuses: understanding what goes through; control characters that the menu does not use, since a gateway that
+has been broken into must not speak to root's terminal.
 Threads: the main one alone, because of the signals.
 """
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import os
@@ -22,9 +24,11 @@ from pathlib import Path
 from typing import Final
 
 from gateway.link import Waker, plain_reason, wait_ready
+from gateway.plain_text import printable
 
 LEAVE: Final = b"\x1d"  # Ctrl-], as in telnet
 READ_BYTES: Final = 4096
+CONTROLS: Final = "\r\n\b"  # all that the menu uses
 WRITE_BYTES: Final = 512  # so many always fit when a pipe says that it is ready
 SIGNALS: Final = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 _ABSENT: Final = (errno.ENOENT, errno.ECONNREFUSED, errno.ENOTDIR)
@@ -104,6 +108,7 @@ def _raw(descriptor: int) -> Iterator[None]:
 def _relay(connection: socket.socket, waker: Waker, stdin_fd: int, stdout_fd: int) -> str:
     """Carry bytes both ways; return what went wrong, "" if nothing did."""
     reading = [connection.fileno(), stdin_fd]
+    text = codecs.getincrementaldecoder("utf-8")("replace")
     try:
         while True:
             ready = wait_ready((*reading, waker.fileno()), (), None)
@@ -111,7 +116,7 @@ def _relay(connection: socket.socket, waker: Waker, stdin_fd: int, stdout_fd: in
                 shown = connection.recv(READ_BYTES)
                 if not shown:
                     return ""
-                _show(waker, stdout_fd, shown)
+                _show(waker, stdout_fd, printable(text.decode(shown), CONTROLS).encode())
             if waker.ended:
                 return "ended by a signal"
             if stdin_fd in ready:

@@ -188,12 +188,22 @@ def strange_gateway(path: Path, says: bytes) -> Iterator[threading.Thread]:
         thread.join(PATIENCE_S)
 
 
-def test_a_gateway_that_breaks_down_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("says", "is_shown"),
+    [
+        (b"hello", "hello"),
+        ("> no\b \b\r\nSí, ≥ 5 °C".encode(), "> no\b \b\r\nSí, ≥ 5 °C"),
+        ("\x1b]0;evil\x07\x9b31m".encode() + b"\xff", "\\x1b]0;evil\\x07\\x9b31m\ufffd"),  # who has broken into it
+    ],
+)
+def test_a_gateway_that_breaks_down_is_told_and_moves_no_cursor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], says: bytes, is_shown: str
+) -> None:
     silent, keyboard = os.pipe()
     shown, screen = os.pipe()
-    with strange_gateway(tmp_path / "control", b"hello"):
+    with strange_gateway(tmp_path / "control", says):
         assert run_menu(tmp_path / "control", silent, screen) == 1
-    assert os.read(shown, 100) == b"hello"
+    assert os.read(shown, 100).decode() == is_shown
     assert "the gateway is gone" in capsys.readouterr().err
     for end in (silent, keyboard, shown, screen):
         os.close(end)
