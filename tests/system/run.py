@@ -33,7 +33,8 @@ class Outcomes:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.when != "call" and report.passed:
             return
-        name = report.nodeid.rpartition("/")[2]
+        path, _, test = report.nodeid.partition("::")
+        name = f"{Path(path).name}::{test}"
         lines = [f"- {name}: **{report.outcome}** in {report.duration:.0f} s, {self._stamp}"]
         lines += [f"  - {figure}: {value}" for figure, value in report.user_properties]
         self.entries[name] = "\n".join(lines)

@@ -283,6 +283,7 @@ def test_a_file_that_was_brought_before_is_used_and_can_be_saved(system: Debian,
         "groupadd --gid 4711 rtugate",
         "umask 077; export LANG=de_DE.UTF-8 STATE_DIRECTORY=/x RUNTIME_DIRECTORY=/y",
     ],
+    ids=["a broken file", "a dangling link", "a folder elsewhere", "a user", "a group", "an environment"],
 )
 def test_whatever_was_there_it_can_be_installed_and_purged(system: Debian, package: Path, beforehand: str) -> None:
     told = system.shell(f"{beforehand}; dpkg --install {system.bring(package)}")
