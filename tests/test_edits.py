@@ -511,25 +511,6 @@ def _as_root(top: Path, command: list[str]) -> subprocess.CompletedProcess[str]:
 
 
 def test_what_the_gateway_says_moves_no_cursor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with answering(tmp_path / "control", "hello\x1b]0;evil\x07\nworld\n"):
+    with a_gateway(tmp_path / "control", b"hello\x1b]0;evil\x07\nworld\n"):
         assert cli.main(["--state", str(tmp_path), "status"]) == 0
     assert capsys.readouterr().out == "hello\\x1b]0;evil\\x07\nworld\n"
-
-
-@contextmanager
-def answering(path: Path, answer: str) -> Iterator[None]:
-    """Something that is in the gateway's place, and says *answer* to whoever asks."""
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
-
-        def serve() -> None:
-            connection, _ = listener.accept()
-            with connection:
-                connection.recv(4096)
-                connection.sendall(answer.encode())
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        yield
-        thread.join()

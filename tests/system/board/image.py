@@ -16,7 +16,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +63,7 @@ class Base:
 
 def base(packages: Sequence[str] = ()) -> Base:
     """Return what a board with *packages* beyond the bare system boots from, made now if nobody has made it yet."""
-    demand_programs()
+    demand(PROGRAMS, "only root can make the board's disks: their files belong to many users")
     made = cache() / _name(packages)
     with _alone(cache()):
         if not made.exists():
@@ -71,10 +71,11 @@ def base(packages: Sequence[str] = ()) -> Base:
     return Base(made)
 
 
-def demand_programs() -> None:
-    missing = [package for program, package in PROGRAMS.items() if shutil.which(program) is None]
+def demand(programs: Mapping[str, str], rights: str) -> None:
+    """Fail unless *programs* are here, each with the package that brings it, and we are root; *rights*: why that."""
+    missing = sorted({package for program, package in programs.items() if shutil.which(program) is None})
     assert not missing, f"missing: apt-get install {' '.join(missing)}"
-    assert os.geteuid() == 0, "only root can make the board's disks: their files belong to many users"
+    assert os.geteuid() == 0, rights
 
 
 def cache() -> Path:

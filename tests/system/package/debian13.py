@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from tests.system.board.image import cache, mirror
+from tests.system.board.image import cache, demand, mirror
 
 HERE: Final = Path(__file__).parent
 PACKAGES: Final = ("systemd-sysv", "udev", "kmod", "login", "libpam-modules", "ca-certificates")
@@ -54,9 +54,7 @@ exec chroot "$root" "$@"
 
 
 def demand_programs() -> None:
-    missing = sorted({package for program, package in PROGRAMS.items() if shutil.which(program) is None})
-    assert not missing, f"missing: apt-get install {' '.join(missing)}"
-    assert os.geteuid() == 0, "only root can make a system whose files belong to many users"
+    demand(PROGRAMS, "only root can make a system whose files belong to many users")
 
 
 @dataclass(frozen=True)
